@@ -1,0 +1,1 @@
+"""One learner, pure functions over one lane."""

@@ -1,0 +1,153 @@
+"""An LSTM over a masked window, with its gradient written by hand.
+
+Shapes: ``T`` tokens, ``B`` batch, ``I`` inputs, ``H`` width. Time comes first.
+
+Two things make it fast on a CPU: the input's product is taken for all tokens at once, before the
+scan; and the backward scan carries only the gradient of the carry and emits the gates' gradients,
+so that each weight's gradient is one large product after it. `reference` is the obvious version
+that the tests compare with.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+Params = dict[str, jax.Array]
+
+
+class Carry(NamedTuple):
+    """The LSTM's state. ``hidden`` and ``cell``: [B, H]."""
+
+    hidden: jax.Array
+    cell: jax.Array
+
+
+def init_lstm(key: jax.Array, inputs: int, width: int) -> Params:
+    """Parameters, uniform in ±1/sqrt(width), with two bias vectors. Gates stand as i, f, g, o."""
+    bound = width**-0.5
+    shapes = {
+        "input_kernel": (inputs, 4 * width),
+        "recurrent_kernel": (width, 4 * width),
+        "input_bias": (4 * width,),
+        "recurrent_bias": (4 * width,),
+    }
+    keys = jax.random.split(key, len(shapes))
+    return {
+        name: jax.random.uniform(k, shape, jnp.float32, -bound, bound)
+        for k, (name, shape) in zip(keys, shapes.items(), strict=True)
+    }
+
+
+def zero_carry(batch: int, width: int) -> Carry:
+    """The carry before any token."""
+    zeros = jnp.zeros((batch, width), jnp.float32)
+    return Carry(zeros, zeros)
+
+
+def lstm(params: Params, inputs: jax.Array, exists: jax.Array, carry: Carry) -> Carry:
+    """The carry after all tokens.
+
+    Args:
+        params: of `init_lstm`.
+        inputs: [T, B, I].
+        exists: bool [T, B]. A token that does not exist leaves the carry as it was, **provided**
+            that it stands before all that exist and that its carry is zero, as in a window: the
+            candidate is then masked, which keeps a zero carry zero at no cost.
+        carry: what the LSTM starts from.
+    """
+    return _lstm(
+        params["input_kernel"],
+        params["recurrent_kernel"],
+        params["input_bias"] + params["recurrent_bias"],
+        inputs,
+        exists,
+        carry,
+    )
+
+
+def reference(params: Params, inputs: jax.Array, exists: jax.Array, carry: Carry) -> Carry:
+    """`lstm` as one would write it down; for the tests."""
+    for x, there in zip(inputs, exists, strict=True):
+        gates = x @ params["input_kernel"] + carry.hidden @ params["recurrent_kernel"]
+        gates = gates + (params["input_bias"] + params["recurrent_bias"])[None, :]
+        i, f, g, o = jnp.split(gates, 4, axis=-1)
+        cell = jax.nn.sigmoid(f) * carry.cell + jax.nn.sigmoid(i) * jnp.tanh(g)
+        new = Carry(jax.nn.sigmoid(o) * jnp.tanh(cell), cell)
+        carry = Carry(*(jnp.where(there[:, None], n, c) for n, c in zip(new, carry, strict=True)))
+    return carry
+
+
+def _sigmoid(x: jax.Array) -> jax.Array:
+    # One tanh is cheaper here than the logistic's exponential and division.
+    return 0.5 * jnp.tanh(0.5 * x) + 0.5
+
+
+def _project(input_kernel: jax.Array, bias: jax.Array, inputs: jax.Array) -> jax.Array:
+    tokens, batch, size = inputs.shape
+    flat = inputs.reshape(tokens * batch, size) @ input_kernel + bias[None, :]
+    return flat.reshape(tokens, batch, -1)
+
+
+def _cell(gates: jax.Array, exists: jax.Array, cell: jax.Array):
+    i, f, g, o = jnp.split(gates, 4, axis=-1)
+    i, f, o = _sigmoid(i), _sigmoid(f), _sigmoid(o)
+    g = jnp.where(exists[:, None], jnp.tanh(g), 0.0)
+    cell = f * cell + i * g
+    return (i, f, g, o), cell, o * jnp.tanh(cell)
+
+
+@jax.custom_vjp
+def _lstm(input_kernel, recurrent_kernel, bias, inputs, exists, carry: Carry) -> Carry:
+    projected = _project(input_kernel, bias, inputs)
+
+    def token(carry: Carry, x):
+        gates, there = x
+        _, cell, hidden = _cell(gates + carry.hidden @ recurrent_kernel, there, carry.cell)
+        return Carry(hidden, cell), None
+
+    return lax.scan(token, carry, (projected, exists))[0]
+
+
+def _forward(input_kernel, recurrent_kernel, bias, inputs, exists, carry: Carry):
+    projected = _project(input_kernel, bias, inputs)
+
+    def token(carry: Carry, x):
+        gates, there = x
+        activations, cell, hidden = _cell(
+            gates + carry.hidden @ recurrent_kernel, there, carry.cell
+        )
+        return Carry(hidden, cell), (carry, activations)
+
+    end, (before, activations) = lax.scan(token, carry, (projected, exists))
+    return end, (input_kernel, recurrent_kernel, inputs, exists, before, activations)
+
+
+def _backward(residuals, gradient: Carry):
+    input_kernel, recurrent_kernel, inputs, exists, before, activations = residuals
+
+    def token(gradient: Carry, x):
+        there, cell_before, (i, f, g, o) = x
+        tanh_cell = jnp.tanh(f * cell_before + i * g)
+        d_cell = gradient.cell + gradient.hidden * o * (1.0 - tanh_cell * tanh_cell)
+        d_gates = jnp.concatenate(
+            (
+                d_cell * g * i * (1.0 - i),
+                d_cell * cell_before * f * (1.0 - f),
+                jnp.where(there[:, None], d_cell * i * (1.0 - g * g), 0.0),
+                gradient.hidden * tanh_cell * o * (1.0 - o),
+            ),
+            axis=-1,
+        )
+        return Carry(d_gates @ recurrent_kernel.T, d_cell * f), d_gates
+
+    start, d_gates = lax.scan(token, gradient, (exists, before.cell, activations), reverse=True)
+    flat = d_gates.reshape(-1, d_gates.shape[-1])
+    d_input_kernel = inputs.reshape(-1, inputs.shape[-1]).T @ flat
+    d_recurrent_kernel = before.hidden.reshape(-1, recurrent_kernel.shape[0]).T @ flat
+    d_inputs = (flat @ input_kernel.T).reshape(inputs.shape)
+    return d_input_kernel, d_recurrent_kernel, flat.sum(axis=0), d_inputs, None, start
+
+
+_lstm.defvjp(_forward, _backward)

@@ -1,0 +1,117 @@
+"""Windows: the tokens that an agent may read, cut from a ring of steps (spec section 1).
+
+One function, `past_tokens`, serves acting, replay, evaluation and deployment. Its invariant: the
+tokens that exist are the last of the window. What is before an episode's first step, before the
+oldest step kept, or beyond the history length does not exist; it is not a zero token.
+
+Shapes: ``C`` capacity of the ring, ``L`` past tokens, ``B`` batch, ``O`` and ``A`` sizes of an
+observation and an action.
+"""
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+
+@struct.dataclass
+class Steps:
+    """A ring of steps; step number n of a lane stands in slot ``n % C``.
+
+    Attributes:
+        observation: [C, O], what the agent saw at the step.
+        previous_action: [C, A], the action before it; zero at an episode's first step.
+        action: [C, A], what it did.
+    """
+
+    observation: jax.Array
+    previous_action: jax.Array
+    action: jax.Array
+
+
+@struct.dataclass
+class Window:
+    """What a network may read at one step of each of B episodes, besides the current action.
+
+    Attributes:
+        past: steps, leaves [L, B, ...], oldest first.
+        length: int32 [B], how many of the past tokens exist; they are the last ones.
+        observation: [B, O], the current observation.
+        previous_action: [B, A], the action before it; zero at an episode's first step.
+    """
+
+    past: Steps
+    length: jax.Array
+    observation: jax.Array
+    previous_action: jax.Array
+
+    @property
+    def exists(self) -> jax.Array:
+        """Which of the past tokens exist: bool [L, B]."""
+        offset = jnp.arange(self.past.action.shape[0], 0, -1, dtype=jnp.int32)
+        return offset[:, None] <= self.length[None, :]
+
+
+def empty_steps(capacity: int, observation_size: int, action_size: int) -> Steps:
+    """A ring without steps."""
+    return Steps(
+        observation=jnp.zeros((capacity, observation_size), jnp.float32),
+        previous_action=jnp.zeros((capacity, action_size), jnp.float32),
+        action=jnp.zeros((capacity, action_size), jnp.float32),
+    )
+
+
+def put_row(ring: jax.Array, slot: jax.Array, row: jax.Array) -> jax.Array:
+    """``ring`` [C, ...] with ``row`` [...] in ``slot``: one row is written, in place under jit."""
+    return jax.lax.dynamic_update_index_in_dim(ring, row.astype(ring.dtype), slot, axis=0)
+
+
+def put_step(ring: Steps, number: jax.Array, step: Steps) -> Steps:
+    """The ring after step ``number`` (int32 []), whose leaves are [O] and [A]."""
+    slot = number % ring.action.shape[0]
+    return jax.tree.map(lambda kept, row: put_row(kept, slot, row), ring, step)
+
+
+def past_tokens(
+    ring: Steps, number: jax.Array, age: jax.Array, count: jax.Array, tokens: int
+) -> tuple[Steps, jax.Array]:
+    """The ``tokens`` steps before step ``number``, and how many of them may be read.
+
+    Args:
+        ring: the steps.
+        number: int32 [B], the step whose past is asked for; at most ``count``.
+        age: int32 [B], steps of the same episode before it.
+        count: int32 [], steps ever written; the ring holds the last C of them.
+        tokens: L.
+
+    Returns:
+        Steps with leaves [L, B, ...], and int32 [B]: min(age, L, steps still in the ring).
+    """
+    capacity = ring.action.shape[0]
+    offset = jnp.arange(tokens, 0, -1, dtype=jnp.int32)
+    slots = (number[None, :] - offset[:, None]) % capacity
+    past = jax.tree.map(lambda kept: kept[slots], ring)
+    oldest = jnp.maximum(count - capacity, 0)
+    length = jnp.minimum(jnp.minimum(age, number - oldest), tokens)
+    return past, length.astype(jnp.int32)
+
+
+def next_window(
+    window: Window, action: jax.Array, next_observation: jax.Array, history_length: jax.Array | int
+) -> Window:
+    """The window one step later: the current step has become a past token.
+
+    Args:
+        window: of the current step.
+        action: [B, A], what was done.
+        next_observation: [B, O], what was then seen, a final observation included.
+        history_length: l, the most past tokens that may be read.
+    """
+    current = Steps(window.observation, window.previous_action, action)
+    tokens = window.past.action.shape[0]
+    past = jax.tree.map(
+        lambda old, new: jnp.concatenate((old, new[None]))[1:] if tokens else old,
+        window.past,
+        current,
+    )
+    length = jnp.minimum(jnp.minimum(window.length + 1, tokens), history_length)
+    return Window(past, length.astype(jnp.int32), next_observation, action)

@@ -1,0 +1,158 @@
+"""The configuration of one agent's training: every field, its default and the reason for it.
+
+The command line, the saved ``config.json`` and the documentation are derived from these fields, so
+that a hyper-parameter is written once. The paper states no hyper-parameters; the defaults are those
+of the published TD3 (Fujimoto et al., 2018) and LSTM-TD3 (Meng et al., 2021).
+"""
+
+import dataclasses
+import math
+import warnings
+from typing import Any
+
+from rtd3jax.errors import UserError, nearest
+
+ALGORITHMS = (
+    "td3",
+    "lstm-td3",
+    "lstm-td3-no-action",
+    "lstm-td3-1ha1hc",
+    "lstm-td3-1ha2hc",
+    "h-td3",
+)
+"""The six agents of the paper; ``rtd3jax.agents.variants`` says what each reads."""
+
+DEFAULT_HISTORY_LENGTH = 10
+
+
+def _field(default: Any, help: str, *, traced: bool = False, low: float, high: float = math.inf):
+    """A configuration field. Lanes of one program may differ in those that are ``traced``.
+
+    ``low`` and ``high`` are the inclusive bounds of the values that make sense.
+    """
+    return dataclasses.field(
+        default=default, metadata={"help": help, "traced": traced, "low": low, "high": high}
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Everything that determines one agent's training, except the environment and the seed.
+
+    Raises:
+        UserError: when a value is impossible, naming the field and the remedy.
+    """
+
+    algorithm: str = dataclasses.field(
+        default="lstm-td3-1ha1hc",
+        metadata={"help": "the agent: " + ", ".join(ALGORITHMS), "traced": False},
+    )
+    history_length: int | None = _field(
+        None, "past steps in a window, l in the paper (td3 has none: 0) [10]", low=1
+    )
+    total_steps: int = _field(30_000, "environment steps of a lane", low=1)
+    hidden_size: int = _field(128, "width H of every layer (the paper's Table: 128)", low=1)
+    batch_size: int = _field(100, "transitions in an update (LSTM-TD3: 100)", low=1)
+    actor_learning_rate: float = _field(1e-3, "Adam's step for the actor", traced=True, low=0)
+    critic_learning_rate: float = _field(1e-3, "Adam's step for the critics", traced=True, low=0)
+    gamma: float = _field(0.99, "discount factor", traced=True, low=0, high=1)
+    tau: float = _field(
+        0.005, "share of the online weights in a target update", traced=True, low=0, high=1
+    )
+    exploration_noise: float = _field(
+        0.1, "standard deviation of the acting noise, in half action ranges", traced=True, low=0
+    )
+    target_noise: float = _field(
+        0.2, "standard deviation of target policy smoothing, in half ranges", traced=True, low=0
+    )
+    target_noise_clip: float = _field(
+        0.5, "bound of target policy smoothing, in half ranges", traced=True, low=0
+    )
+    policy_delay: int = _field(2, "critic updates per actor and target update", low=1)
+    learning_starts: int = _field(
+        1_000, "uniform-random steps before the first update; at least batch_size", low=1
+    )
+    replay_capacity: int | None = _field(
+        None, "transitions kept; the oldest leave first [total_steps]", low=1
+    )
+    eval_every: int = _field(1_000, "environment steps between evaluations", low=1)
+    eval_episodes: int = _field(10, "episodes of an evaluation", low=1)
+
+    def __post_init__(self) -> None:
+        if self.algorithm not in ALGORITHMS:
+            raise UserError(
+                f"algorithm {self.algorithm!r} is unknown{nearest(str(self.algorithm), ALGORITHMS)}"
+                f"; the algorithms are {', '.join(ALGORITHMS)}"
+            )
+        self._resolve_history_length()
+        for field in dataclasses.fields(self):
+            if "low" in field.metadata:
+                object.__setattr__(self, field.name, self._checked(field))
+        capacity = self.total_steps if self.replay_capacity is None else self.replay_capacity
+        object.__setattr__(self, "replay_capacity", capacity)
+        if self.batch_size > self.learning_starts:
+            raise UserError(
+                f"batch_size ({self.batch_size}) is larger than learning_starts "
+                f"({self.learning_starts}): the first update would have too few transitions; "
+                "raise learning_starts or lower batch_size"
+            )
+        window = 1 + (self.history_length or 0)
+        if capacity < max(self.batch_size, window):
+            raise UserError(
+                f"replay_capacity ({capacity}) holds less than a batch "
+                f"({self.batch_size}) or a window ({window}); raise it"
+            )
+
+    def _resolve_history_length(self) -> None:
+        if self.algorithm == "td3":
+            if self.history_length not in (None, 0):
+                warnings.warn(
+                    f"history_length={self.history_length} has no effect: td3 has no window",
+                    stacklevel=4,
+                )
+            object.__setattr__(self, "history_length", 0)
+        elif self.history_length is None:
+            object.__setattr__(self, "history_length", DEFAULT_HISTORY_LENGTH)
+
+    def _checked(self, field: dataclasses.Field) -> Any:
+        value = getattr(self, field.name)
+        if value is None and field.default is None:
+            return None
+        integral = "int" in str(field.type)
+        kind = "an integer" if integral else "a number"
+        number = _as_number(value, integral)
+        if number is None:
+            raise UserError(f"{field.name} must be {kind}, not {value!r}")
+        low, high = field.metadata["low"], field.metadata["high"]
+        if field.name == "history_length" and self.algorithm == "td3":
+            low = 0
+        if not low <= number <= high:
+            bounds = f"at least {low}" if high == math.inf else f"between {low} and {high}"
+            raise UserError(f"{field.name} must be {bounds}, not {value!r}")
+        if integral and number >= 2**31:
+            raise UserError(f"{field.name} must be below 2**31, not {value!r}")
+        return number
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields as JSON-ready values."""
+        return dataclasses.asdict(self)
+
+
+def traced_fields() -> tuple[str, ...]:
+    """Names of the fields in which lanes of one program may differ."""
+    return tuple(f.name for f in dataclasses.fields(Config) if f.metadata["traced"])
+
+
+def _as_number(value: Any, integral: bool) -> int | float | None:
+    """``value`` as a plain Python number; None when it is not one (booleans and NaN are not)."""
+    if isinstance(value, bool):
+        return None
+    try:
+        number = float(value) if not isinstance(value, str) else None
+    except (TypeError, ValueError, OverflowError):
+        return None
+    if number is None or not math.isfinite(number):
+        return None
+    if not integral:
+        return number
+    return int(value) if number == int(number) else None

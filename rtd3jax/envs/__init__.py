@@ -1,0 +1,1 @@
+"""The world: environments, and the hidden processes that disturb them."""

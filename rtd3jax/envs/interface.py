@@ -1,0 +1,177 @@
+"""What the learner needs to know of an environment, checked before anything is compiled."""
+
+import contextlib
+import dataclasses
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rtd3jax.errors import UserError
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Interface:
+    """Sizes and bounds; A elements of a flat action."""
+
+    observation_size: int
+    action_shape: tuple[int, ...]
+    action_size: int
+    action_low: np.ndarray
+    """float32 [A]"""
+    action_high: np.ndarray
+    """float32 [A]"""
+
+
+@contextlib.contextmanager
+def foreign_code() -> Iterator[None]:
+    """Run others' environments under JAX's ordinary promotion, however strict this process is."""
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        yield
+
+
+def describe(env: Any, params: Any) -> Interface:
+    """Check that ``env`` is a gymnax >= 1.0 environment that can be learned, and measure it.
+
+    The environment is traced, not compiled. Whatever is wrong is a UserError with the remedy.
+    """
+    name = _name(env)
+    for method in ("reset", "step", "action_space"):
+        if not callable(getattr(env, method, None)):
+            raise UserError(
+                f"environment {name} has no method {method}: it is not a gymnax environment "
+                "(gymnax >= 1.0: reset(key, params), step(key, state, action, params), "
+                "action_space(params))"
+            )
+    with foreign_code():
+        shape, low, high = _bounds(env, params, name)
+        key = jax.eval_shape(lambda: jax.random.key(0))
+        first = _attempt(name, "reset", lambda: jax.eval_shape(env.reset, key, params))
+        if not isinstance(first, tuple) or len(first) != 2:
+            raise UserError(f"environment {name}: reset must return (observation, state)")
+        observation, state = first
+        _check_observation(name, "reset", observation)
+        action = jax.ShapeDtypeStruct(shape, jnp.float32)
+        after = _attempt(name, "step", lambda: jax.eval_shape(env.step, key, state, action, params))
+    _check_step(name, after, observation)
+    return Interface(
+        observation_size=observation.shape[0],
+        action_shape=shape,
+        action_size=low.size,
+        action_low=low,
+        action_high=high,
+    )
+
+
+def action_bounds(env: Any, params: Any) -> tuple[jax.Array, jax.Array]:
+    """Lowest and highest action, [A] each, flat; ``params`` may be traced."""
+    with foreign_code():
+        space = env.action_space(params)
+        low, high = (
+            jnp.broadcast_to(jnp.asarray(bound, jnp.float32), space.shape).reshape(-1)
+            for bound in (space.low, space.high)
+        )
+    return low, high
+
+
+def _name(env: Any) -> str:
+    try:
+        return str(env.name)
+    except Exception:  # a name is for messages only, so a broken one must not hide the message
+        return type(env).__name__
+
+
+def _attempt(name: str, what: str, call: Callable[[], Any]) -> Any:
+    """Run the environment's code; its errors become one line."""
+    try:
+        return call()
+    except UserError:
+        raise
+    except Exception as error:
+        lines = str(error).strip().splitlines()
+        reason = f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+        raise UserError(f"environment {name} failed in {what}: {reason}") from error
+
+
+def _bounds(env: Any, params: Any, name: str) -> tuple[tuple[int, ...], np.ndarray, np.ndarray]:
+    """Shape of an action, and its bounds [A]."""
+    space = _attempt(name, "action_space", lambda: env.action_space(params))
+    if hasattr(space, "n"):
+        raise UserError(
+            f"environment {name} has discrete actions; rtd3jax learns continuous ones: "
+            "choose an environment whose action space is a bounded Box"
+        )
+    if not all(hasattr(space, field) for field in ("low", "high", "shape")):
+        raise UserError(
+            f"environment {name}: the action space {type(space).__name__} is not a Box; "
+            "flatten the action into one bounded Box"
+        )
+    low, high = _attempt(
+        name, "action_space", lambda: [np.asarray(b) for b in action_bounds(env, params)]
+    )
+    if not (np.all(np.isfinite(low)) and np.all(np.isfinite(high))):
+        raise UserError(
+            f"environment {name}: the action space is unbounded; give its Box finite low and high"
+        )
+    if low.size == 0 or not np.all(low < high):
+        raise UserError(f"environment {name}: the action space needs low < high in every element")
+    return tuple(space.shape), low, high
+
+
+def _check_observation(name: str, what: str, observation: Any) -> None:
+    if not hasattr(observation, "dtype"):
+        raise UserError(
+            f"environment {name}: the observation of {what} is a {type(observation).__name__}; "
+            "concatenate its parts into one float array"
+        )
+    if not jnp.issubdtype(observation.dtype, jnp.floating):
+        raise UserError(
+            f"environment {name}: the observation of {what} is {observation.dtype}; "
+            "convert it to float32"
+        )
+    if len(observation.shape) != 1:
+        raise UserError(
+            f"environment {name}: the observation of {what} has shape {observation.shape}; "
+            "flatten it to one dimension"
+        )
+
+
+def _check_step(name: str, after: Any, first_observation: Any) -> None:
+    """Raise UserError unless ``after`` has the six values of gymnax >= 1.0."""
+    count = len(after) if isinstance(after, tuple) else 1
+    if count == 5:
+        raise UserError(
+            f"environment {name}: step returns five values, as before gymnax 1.0; upgrade it to "
+            "return (observation, state, reward, terminated, truncated, info)"
+        )
+    if count != 6:
+        raise UserError(
+            f"environment {name}: step returns {count} values instead of the six of gymnax >= 1.0 "
+            "(observation, state, reward, terminated, truncated, info)"
+        )
+    observation, _, reward, terminated, truncated, info = after
+    _check_observation(name, "step", observation)
+    if observation.shape != first_observation.shape:
+        raise UserError(
+            f"environment {name}: observations of step and reset have shapes "
+            f"{observation.shape} and {first_observation.shape}; make them the same"
+        )
+    for what, value in (("reward", reward), ("terminated", terminated), ("truncated", truncated)):
+        if getattr(value, "shape", None) != ():
+            raise UserError(
+                f"environment {name}: {what} must be a scalar, not of shape "
+                f"{getattr(value, 'shape', type(value).__name__)}"
+            )
+    if not isinstance(info, dict) or "final_observation" not in info:
+        raise UserError(
+            f"environment {name}: info lacks 'final_observation', the observation before the "
+            "automatic reset; inherit step from gymnax >= 1.0's Environment"
+        )
+    final = info["final_observation"]
+    if getattr(final, "shape", None) != observation.shape:
+        raise UserError(
+            f"environment {name}: info['final_observation'] must have the observation's shape "
+            f"{observation.shape}"
+        )

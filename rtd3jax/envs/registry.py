@@ -1,0 +1,253 @@
+"""Environments by name, with a disturbance by name and parameters by name."""
+
+import ast
+import dataclasses
+import math
+import numbers
+import re
+from collections.abc import Callable
+from typing import Any
+
+import gymnax
+
+from rtd3jax.envs.disturbances import DampedSine, GaussianNoise, Hidden, Pulses, Sine
+from rtd3jax.envs.disturbed import Disturbed, DisturbedParams
+from rtd3jax.envs.identity import ValueIdentity, strong, with_identity
+from rtd3jax.envs.interface import foreign_code
+from rtd3jax.envs.pendulum import Pendulum
+from rtd3jax.envs.process import Nothing, Process, require
+from rtd3jax.envs.rover import Rover
+from rtd3jax.envs.slip import Ar1Slip, SineSlip
+from rtd3jax.errors import UserError, nearest
+
+_PROCESSES: dict[str, dict[str, Process]] = {
+    "pendulum": {
+        "none": Nothing(),
+        "temporal-bias": Pulses(),
+        "temporal-sine": Sine(
+            amplitude_min=1.0,
+            amplitude_max=1.0,
+            period_min=70.0,
+            period_max=70.0,
+            elements=(0, 1),
+        ),
+        "random-sine": Sine(),
+        "noise": GaussianNoise(),
+        "hidden": Hidden(),
+        "combined-sine": Sine(waves=2),
+        "damped-sine": DampedSine(),
+    },
+    "rover": {
+        "none": Nothing(),
+        "ar1-slip": Ar1Slip(),
+        "ar1-slip-high-variance": Ar1Slip(sigma=0.10),
+        "ar1-slip-fast": Ar1Slip(rho=0.90),
+        "ar1-slip-slow": Ar1Slip(rho=0.98),
+        "sine-slip": SineSlip(),
+    },
+}
+
+ENVIRONMENTS: tuple[str, ...] = tuple(_PROCESSES)
+"""The paper's worlds. Every gymnax id can be made too, undisturbed."""
+
+DISTURBANCES: dict[str, tuple[str, ...]] = {env: tuple(ids) for env, ids in _PROCESSES.items()}
+"""The disturbances of each world (spec sections 3 and 4)."""
+
+_constructors: dict[str, Callable[..., Any]] = {}
+
+
+def make(env_id: str, disturbance: str = "none", **parameters: Any) -> Any:
+    """Make an environment whose ``default_params`` carry the disturbance and the parameters.
+
+    A parameter is a field of the disturbance, else of the environment's parameters; the pendulum
+    also has ``reward_from`` ("state" or "observation"; the default is "observation" for ``noise``
+    alone, as the paper has it [choice]). ``env_id`` is one of ``ENVIRONMENTS``, a registered id, or
+    a gymnax id.
+    """
+    if env_id in _constructors:
+        return _constructors[env_id](disturbance, **parameters)
+    if env_id in _PROCESSES:
+        process = _lookup(env_id, disturbance)
+        return (
+            _make_pendulum(disturbance, process, parameters)
+            if env_id == "pendulum"
+            else (_make_rover(disturbance, process, parameters))
+        )
+    if env_id in gymnax.registered_envs:
+        if disturbance != "none":
+            raise UserError(f"environment {env_id} has no disturbance {disturbance!r}, only 'none'")
+        return _make_gymnax(env_id, parameters)
+    known = (*ENVIRONMENTS, *_constructors, *gymnax.registered_envs)
+    raise UserError(f"unknown environment {env_id!r}{nearest(env_id, known)}")
+
+
+def register(env_id: str, constructor: Callable[..., Any]) -> None:
+    """Let ``make(env_id, disturbance, **parameters)`` call ``constructor`` with the latter two."""
+    if not isinstance(env_id, str) or not env_id:
+        raise UserError(f"an environment id must be a non-empty string, not {env_id!r}")
+    if not callable(constructor):
+        raise UserError(f"the constructor of {env_id!r} is not callable")
+    if env_id in _constructors or env_id in _PROCESSES or env_id in gymnax.registered_envs:
+        raise UserError(f"environment {env_id!r} exists already; choose another id")
+    _constructors[env_id] = constructor
+
+
+def parse_disturbance(text: str) -> tuple[str, dict[str, Any]]:
+    """Read ``"noise:sigma=1.0,reward_from=state"`` as an id and its parameters.
+
+    Values are Python literals where they can be (``elements=(0,1)``), else strings.
+    """
+    disturbance, _, rest = text.strip().partition(":")
+    if not disturbance:
+        raise UserError(f"disturbance {text!r} has no id; write for example noise:sigma=1.0")
+    parameters: dict[str, Any] = {}
+    # A comma within parentheses belongs to a value.
+    for item in re.split(r",(?![^(]*\))", rest) if rest.strip() else []:
+        name, equals, value = (part.strip() for part in item.partition("="))
+        if not (name and equals and value):
+            raise UserError(f"disturbance {text!r}: {item.strip()!r} is not of the form name=value")
+        if name in parameters:
+            raise UserError(f"disturbance {text!r} gives {name!r} twice")
+        try:
+            parameters[name] = ast.literal_eval(value)
+        except (ValueError, SyntaxError):
+            parameters[name] = value
+    return disturbance.strip(), parameters
+
+
+def _lookup(env_id: str, disturbance: str) -> Process:
+    processes = _PROCESSES[env_id]
+    if disturbance not in processes:
+        raise UserError(
+            f"unknown disturbance {disturbance!r} of {env_id}{nearest(disturbance, processes)} "
+            f"(known: {', '.join(processes)})"
+        )
+    return processes[disturbance]
+
+
+def _make_pendulum(disturbance: str, process: Process, parameters: dict[str, Any]) -> Disturbed:
+    rest = dict(parameters)
+    reward_from = rest.pop("reward_from", "observation" if disturbance == "noise" else "state")
+    base = Pendulum()
+    what = f"pendulum with {disturbance}"
+    process, env_params = _assign(what, (process, base.default_params), rest, ("reward_from",))
+    for name in ("max_speed", "max_torque", "dt", "m", "l"):
+        require(env_params, name, above=0)
+    _validate(process, env_params)
+    env = Disturbed(base, reward_from, DisturbedParams(env=env_params, process=process))
+    env.observation_space()  # raises now if the process does not fit the observation
+    return env
+
+
+def _make_rover(disturbance: str, process: Process, parameters: dict[str, Any]) -> Rover:
+    what = f"rover with {disturbance}"
+    process, params = _assign(what, (process, Rover().default_params), parameters)
+    for name in ("wheelbase", "max_speed", "max_yaw_rate"):
+        require(params, name, above=0)
+    _validate(process, params)
+    return Rover(params.replace(slip=process))
+
+
+def _validate(process: Process, params: Any) -> None:
+    process.validate()
+    require(params, "max_steps_in_episode", low=1)
+
+
+class _Preset(ValueIdentity):
+    """A gymnax environment whose ``default_params`` are given, and whose states are strong.
+
+    It is foreign code, which strict promotion would refuse.
+    """
+
+    _preset_id: str
+    _preset_params: Any
+
+    def identity(self) -> tuple:
+        """The id: gymnax never lets an id be made anew by another factory."""
+        return (self._preset_id,)
+
+    @property
+    def default_params(self) -> Any:
+        """gymnax's, with the parameters given to ``make``."""
+        return self._preset_params
+
+    def step(self, key: Any, state: Any, action: Any, params: Any = None) -> tuple:
+        """Step as gymnax does, with a strong state."""
+        with foreign_code():
+            observation, state, *rest = super().step(key, state, action, params)
+        return (observation, strong(state), *rest)
+
+    def reset(self, key: Any, params: Any = None) -> tuple:
+        """Reset as gymnax does, with a strong state."""
+        with foreign_code():
+            observation, state = super().reset(key, params)
+        return observation, strong(state)
+
+
+def _make_gymnax(env_id: str, parameters: dict[str, Any]) -> Any:
+    try:
+        base, params = gymnax.make(env_id)
+    except Exception as error:
+        raise UserError(
+            f"environment {env_id} cannot be made: {type(error).__name__}: {error}"
+        ) from error
+    (params,) = _assign(env_id, (params,), parameters)
+    if hasattr(params, "max_steps_in_episode"):
+        require(params, "max_steps_in_episode", low=1)
+    env: Any = object.__new__(with_identity(_Preset, type(base)))  # type: ignore[arg-type]
+    env.__dict__.update(vars(base), _preset_id=env_id, _preset_params=params)
+    return env
+
+
+def _assign(
+    what: str, owners: tuple[Any, ...], parameters: dict[str, Any], also: tuple[str, ...] = ()
+) -> tuple[Any, ...]:
+    """Give each parameter to the first owner that has it; return the changed owners.
+
+    ``also`` names parameters that are known but handled elsewhere, for the hint in the message.
+    """
+    changes: list[dict[str, Any]] = [{} for _ in owners]
+    fields = [_settable(owner) for owner in owners]
+    for name, value in parameters.items():
+        for owned, change in zip(fields, changes, strict=True):
+            if name in owned:
+                change[name] = _coerce(what, name, value, owned[name])
+                break
+        else:
+            known = [*(field for owned in fields for field in owned), *also]
+            raise UserError(
+                f"{what} has no parameter {name!r}{nearest(name, known)} "
+                f"(known: {', '.join(known)})"
+            )
+    return tuple(o.replace(**change) for o, change in zip(owners, changes, strict=True))
+
+
+def _settable(owner: Any) -> dict[str, Any]:
+    """The fields that a plain value can set, with their defaults."""
+    values = {field.name: getattr(owner, field.name) for field in dataclasses.fields(owner)}
+    return {name: v for name, v in values.items() if isinstance(v, bool | int | float | tuple)}
+
+
+def _coerce(what: str, name: str, value: Any, default: Any) -> Any:
+    """Return ``value`` as the kind of thing that ``default`` is, or raise UserError."""
+    wrong = f"{what}: {name}={value!r} must be"
+    if isinstance(default, bool):
+        if not isinstance(value, bool):
+            raise UserError(f"{wrong} True or False")
+        return value
+    if isinstance(default, tuple):
+        items = value if isinstance(value, list | tuple) else (value,)
+        if not all(_is_integer(item) for item in items):
+            raise UserError(f"{wrong} a list of whole numbers")
+        return tuple(int(item) for item in items)
+    if isinstance(default, int):
+        if not _is_integer(value):
+            raise UserError(f"{wrong} a whole number")
+        return int(value)
+    if not isinstance(value, numbers.Real) or isinstance(value, bool) or not math.isfinite(value):
+        raise UserError(f"{wrong} a finite number")
+    return float(value)
+
+
+def _is_integer(value: Any) -> bool:
+    return isinstance(value, numbers.Integral) and not isinstance(value, bool)

@@ -1,0 +1,14 @@
+"""The one kind of error that is meant for the user's eyes."""
+
+import difflib
+from collections.abc import Iterable
+
+
+class UserError(ValueError):
+    """An error whose message is one clear line for the user."""
+
+
+def nearest(word: str, choices: Iterable[str]) -> str:
+    """Return ``"; did you mean 'x'?"`` for the choice most like ``word``, or ``""`` if none is."""
+    matches = difflib.get_close_matches(str(word), [str(c) for c in choices], n=1)
+    return f"; did you mean {matches[0]!r}?" if matches else ""

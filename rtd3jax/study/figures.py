@@ -1,0 +1,371 @@
+"""Figures of a study: learning curves and final returns, each as PNG and SVG.
+
+Built on matplotlib's object API without pyplot, so that drawing needs no display and shares no
+current figure with the caller. Equal data give equal SVG bytes.
+"""
+
+import io
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import EngFormatter, MaxNLocator
+
+from rtd3jax.study.results import REFERENCES, write_bytes_atomically
+from rtd3jax.study.statistics import seed_means, summarise
+
+# Colours that remain apart for colour-blind readers: the palette of Okabe and Ito, "Color
+# Universal Design", 2008. The order is that of legends and axes.
+COLOURS = {
+    "td3": "#000000",
+    "h-td3": "#D55E00",
+    "lstm-td3": "#0072B2",
+    "lstm-td3-no-action": "#E69F00",
+    "lstm-td3-1ha1hc": "#009E73",
+    "lstm-td3-1ha2hc": "#CC79A7",
+}
+OTHER_COLOUR = "#56B4E9"
+REFERENCE_COLOUR = "#777777"
+REFERENCE_DASHES = {"random": (0, (2, 2)), "constant": (0, (7, 3))}
+# The algorithm without a history window, shown beside every window length.
+WINDOWLESS = "td3"
+MARKERS = "osD^vPX"
+
+# Share of the lower edges of the bands that may fall below a learning-curve panel.
+CLIPPED_SHARE = 0.05
+
+_STYLE: Any = {
+    "svg.hashsalt": "rtd3jax",  # otherwise element ids are random
+    "font.size": 9.0,
+    "axes.titlesize": 9.5,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "grid.color": "#E4E4E4",
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+}
+
+
+def learning_curves(
+    curves: pd.DataFrame, references: pd.DataFrame | None, directory: str | Path
+) -> list[Path]:
+    """Draw mean return against environment steps; return the paths of the PNG and the SVG.
+
+    ``curves`` has the columns of CURVES; ``references`` those of EPISODES, of which only the
+    reference policies are used. One panel per disturbance (rows) and history length (columns);
+    a line is the mean over the seeds with a finite value at that step, its band one standard
+    deviation (ddof 1) either side.
+
+    The panels of a row share their y-limits: from the 5th percentile of all lower band edges
+    (or the lowest final mean, if lower, so that no line ends outside) to the highest upper edge.
+    Very bad returns early in training thus leave the panel instead of squashing the rest.
+    """
+    with mpl.rc_context(_STYLE):
+        tasks = _tasks(curves)
+        windows = curves.loc[curves["algorithm"] != WINDOWLESS, "history_length"]
+        lengths = sorted({int(length) for length in windows})
+        figure, grid = _panels(len(tasks), max(len(lengths), 1), width=3.6, height=2.7)
+        if not tasks:
+            _note_empty(grid[0, 0], "no learning curves")
+        for row, task in zip(grid, tasks, strict=False):
+            _curve_row(row, curves, references, task, lengths, _title(tasks, task))
+        for axes in grid[-1]:
+            axes.set_xlabel("environment steps")
+        for axes in grid[:, 0]:
+            axes.set_ylabel("mean return")
+        handles = [
+            Line2D([], [], color=_colour(name), linewidth=1.8, label=name)
+            for name in _ordered(curves["algorithm"])
+        ]
+        _legend(figure, handles + _reference_handles(references))
+        return _save(figure, directory, "learning_curves")
+
+
+def final_returns(episodes: pd.DataFrame, directory: str | Path) -> list[Path]:
+    """Draw the final evaluation; return the paths of the PNG and the SVG.
+
+    ``episodes`` has the columns of EPISODES. One panel per disturbance with the algorithms along
+    x; faint dots are the mean returns of single seeds, the marker is their interquartile mean and
+    the bar its 95 % bootstrap interval (none for a single seed). Marker shapes tell the history
+    lengths apart; horizontal lines are the reference policies.
+    """
+    with mpl.rc_context(_STYLE):
+        lanes = seed_means(episodes)
+        trained = lanes[~lanes["algorithm"].isin(REFERENCES)]
+        tasks = _tasks(lanes)
+        algorithms = _ordered(trained["algorithm"])
+        lengths = sorted({int(length) for length in trained["history_length"]})
+        rows, columns = math.ceil(max(len(tasks), 1) / 2), min(max(len(tasks), 1), 2)
+        width = max(3.8, 0.9 + len(algorithms) * (0.45 + 0.1 * len(lengths)))
+        figure, grid = _panels(rows, columns, width=width, height=3.4)
+        panels = list(grid.flat)
+        if not tasks:
+            _note_empty(panels[0], "no final evaluation")
+        for axes, task in zip(panels, tasks, strict=False):
+            _final_panel(axes, _of_task(trained, task), algorithms, lengths)
+            _fit(axes, _of_task(trained, task)["return"], _reference_means(episodes, task))
+            axes.set_title(_title(tasks, task))
+        for axes in panels[max(len(tasks), 1) :]:
+            axes.remove()
+        for axes in grid[:, 0]:
+            axes.set_ylabel("return of the final policy")
+        handles = [
+            Line2D([], [], color="#555555", marker=marker, linestyle="", label=_window(length))
+            for length, marker in zip(lengths, _markers(lengths), strict=True)
+        ]
+        _legend(figure, handles + _reference_handles(episodes))
+        return _save(figure, directory, "final_returns")
+
+
+def _curve_row(
+    row: Iterable[Axes],
+    curves: pd.DataFrame,
+    references: pd.DataFrame | None,
+    task: tuple[str, str],
+    lengths: list[int],
+    title: str,
+) -> None:
+    """Draw the panels of one task, one per history length, with common y-limits."""
+    of_task = _of_task(curves, task)
+    row = list(row)
+    lower, upper, final = [], [], []
+    columns: list[int | None] = list(lengths) or [None]
+    for axes, length in zip(row, columns, strict=True):
+        axes.set_title(title if length is None else f"{title}, {_window(length)}")
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.xaxis.set_major_locator(MaxNLocator(5))
+        for name in _ordered(of_task["algorithm"]):
+            line = of_task[of_task["algorithm"] == name]
+            if name != WINDOWLESS:
+                line = line[line["history_length"] == length]
+            steps, mean, std = _band(line)
+            if steps.size == 0:
+                continue
+            colour = _colour(name)
+            axes.plot(steps, mean, color=colour, linewidth=1.6, label=name, zorder=3)
+            axes.fill_between(steps, mean - std, mean + std, color=colour, alpha=0.15, linewidth=0)
+            lower.append(mean - std)
+            upper.append(mean + std)
+            final.append(mean[-1])
+    means = {} if references is None else _reference_means(references, task)
+    edges = np.array([])
+    if lower:
+        bottom = min(np.quantile(np.concatenate(lower), CLIPPED_SHARE), min(final))
+        edges = np.array([bottom, np.concatenate(upper).max()])
+    for axes in row:
+        _fit(axes, edges, means)
+
+
+def _band(line: pd.DataFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Steps, mean and standard deviation over seeds [evaluations]; steps without values left out.
+
+    A single seed has standard deviation 0 here: its line is drawn without a band.
+    """
+    values = line["return"].astype(np.float64)
+    values = values[np.isfinite(values)].groupby(line["step"], sort=True)
+    mean, std = values.mean(), values.std(ddof=1).fillna(0.0)
+    return mean.index.to_numpy(), mean.to_numpy(), std.to_numpy()
+
+
+def _final_panel(
+    axes: Axes, lanes: pd.DataFrame, algorithms: list[str], lengths: list[int]
+) -> None:
+    """Draw seeds, IQM and interval of each (algorithm, history length) of one task."""
+    markers = dict(zip(lengths, _markers(lengths), strict=True))
+    for position, name in enumerate(algorithms):
+        of_algorithm = lanes[lanes["algorithm"] == name]
+        present = sorted({int(length) for length in of_algorithm["history_length"]})
+        # Spread evenly about the tick, by the lengths this algorithm has, so td3 is centred.
+        gap = 0.7 / max(len(lengths), 3)
+        for index, length in enumerate(present):
+            values = of_algorithm.loc[of_algorithm["history_length"] == length, "return"]
+            summary = summarise(values)
+            if summary.n == 0:
+                continue
+            x = position + gap * (index - (len(present) - 1) / 2)
+            finite = values[np.isfinite(values)]
+            # Beside the marker, not under it: the dots would hide behind the bar.
+            axes.scatter(
+                np.full(len(finite), x - 0.32 * gap),
+                finite,
+                s=9,
+                color=_colour(name),
+                alpha=0.35,
+                linewidths=0,
+                zorder=2,
+            )
+            if summary.n >= 2:
+                bounds = [summary.iqm_low, summary.iqm_high]
+                axes.plot([x, x], bounds, color=_colour(name), linewidth=1.6, zorder=3)
+            axes.plot(
+                x,
+                summary.iqm,
+                marker=markers[length],
+                markersize=6,
+                color=_colour(name),
+                markeredgecolor="white",
+                markeredgewidth=0.7,
+                linestyle="",
+                label=f"{name} {length}",
+                zorder=4,
+            )
+    axes.set_xticks(
+        range(len(algorithms)), algorithms, rotation=28, ha="right", rotation_mode="anchor"
+    )
+    axes.set_xlim(-0.6, max(len(algorithms), 1) - 0.4)
+    axes.grid(False, axis="x")
+
+
+def _fit(axes: Axes, values: Iterable[float], references: dict[str, float]) -> None:
+    """Set y-limits around ``values`` and draw the reference lines.
+
+    A reference farther away than the range of the values is named at the edge instead, since
+    showing its line would squash everything else.
+    """
+    values = np.asarray(list(values), dtype=np.float64)
+    values = values[np.isfinite(values)]
+    if values.size == 0:
+        values = np.array(list(references.values()) or [0.0])
+    low, high = float(values.min()), float(values.max())
+    span = (high - low) or max(abs(high), 1.0) * 0.1
+    near = [mean for mean in references.values() if low - span <= mean <= high + span]
+    low, high = min([low, *near]), max([high, *near])
+    margin = 0.06 * ((high - low) or span)
+    far: dict[str, list[str]] = {"top": [], "bottom": []}
+    for name, mean in references.items():
+        if mean in near:
+            axes.axhline(
+                mean,
+                color=REFERENCE_COLOUR,
+                linestyle=REFERENCE_DASHES[name],
+                linewidth=1.2,
+                label=name,
+                zorder=2.5,
+            )
+        else:
+            arrow, edge = ("↑", "top") if mean > high else ("↓", "bottom")
+            far[edge].append(f"{arrow} {name}: {mean:.4g}")
+    for edge, texts in far.items():
+        if texts:
+            # Free space for the words, so that no curve runs through them.
+            room = 0.12 * (high - low + 2 * margin)
+            low, high = (low - room, high) if edge == "bottom" else (low, high + room)
+            axes.text(
+                0.98,
+                0.02 if edge == "bottom" else 0.98,
+                "   ".join(texts),
+                transform=axes.transAxes,
+                ha="right",
+                va=edge,
+                fontsize=7.5,
+                color="#555555",
+                bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
+                zorder=5,
+            )
+    axes.set_ylim(low - margin, high + margin)
+
+
+def _reference_means(episodes: pd.DataFrame, task: tuple[str, str]) -> dict[str, float]:
+    """Mean return over all finite episodes of each reference policy that has any."""
+    means = {}
+    of_task = _of_task(episodes, task)
+    for name in REFERENCES:
+        values = of_task.loc[of_task["algorithm"] == name, "return"].to_numpy(np.float64)
+        values = values[np.isfinite(values)]
+        if values.size:
+            means[name] = float(values.mean())
+    return means
+
+
+def _reference_handles(episodes: pd.DataFrame | None) -> list[Line2D]:
+    present = set() if episodes is None else set(episodes["algorithm"])
+    return [
+        Line2D(
+            [],
+            [],
+            color=REFERENCE_COLOUR,
+            linestyle=REFERENCE_DASHES[name],
+            linewidth=1.2,
+            label=f"{name} policy",
+        )
+        for name in REFERENCES
+        if name in present
+    ]
+
+
+def _panels(rows: int, columns: int, width: float, height: float) -> tuple[Figure, np.ndarray]:
+    """A figure with [rows, columns] panels of ``width`` by ``height`` inches each."""
+    rows = max(rows, 1)
+    # A floor on the width leaves a lone panel room for its legend.
+    figure = Figure(figsize=(max(width * columns, 5.2), height * rows + 0.7), layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def _legend(figure: Figure, handles: list[Line2D]) -> None:
+    """One legend below all panels, where it cannot cover data."""
+    if handles:
+        # About 1.6 inches per entry.
+        columns = max(1, min(len(handles), int(figure.get_figwidth() / 1.6)))
+        figure.legend(handles=handles, loc="outside lower center", ncols=columns)
+
+
+def _note_empty(axes: Axes, text: str) -> None:
+    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center")
+
+
+def _save(figure: Figure, directory: str | Path, stem: str) -> list[Path]:
+    paths = []
+    for suffix, options in (
+        ("png", {"dpi": 160}),
+        ("svg", {"metadata": {"Date": None, "Creator": None}}),
+    ):
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format=suffix, **options)
+        path = Path(directory) / f"{stem}.{suffix}"
+        write_bytes_atomically(path, buffer.getvalue())
+        paths.append(path)
+    return paths
+
+
+def _tasks(table: pd.DataFrame) -> list[tuple[str, str]]:
+    """The (env, disturbance) pairs of ``table``, sorted with the undisturbed ones first."""
+    pairs = set(zip(table["env"], table["disturbance"], strict=True))
+    return sorted(pairs, key=lambda pair: (pair[0], pair[1] != "none", pair[1]))
+
+
+def _of_task(table: pd.DataFrame, task: tuple[str, str]) -> pd.DataFrame:
+    return table[(table["env"] == task[0]) & (table["disturbance"] == task[1])]
+
+
+def _title(tasks: list[tuple[str, str]], task: tuple[str, str]) -> str:
+    """The disturbance, with its environment only where the study has several."""
+    name = "no disturbance" if task[1] == "none" else task[1]
+    return name if len({env for env, _ in tasks}) == 1 else f"{task[0]}: {name}"
+
+
+def _ordered(names: Iterable[str]) -> list[str]:
+    """Distinct trained algorithms in the order of COLOURS, unknown ones last."""
+    known = list(COLOURS)
+    distinct = set(names) - set(REFERENCES)
+    return sorted(distinct, key=lambda n: (known.index(n) if n in COLOURS else len(known), n))
+
+
+def _colour(name: str) -> str:
+    return COLOURS.get(name, OTHER_COLOUR)
+
+
+def _markers(lengths: list[int]) -> list[str]:
+    return [MARKERS[index % len(MARKERS)] for index in range(len(lengths))]
+
+
+def _window(length: int) -> str:
+    return f"history {length}"

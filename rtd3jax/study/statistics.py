@@ -1,0 +1,106 @@
+"""Statistics over the seeds of one experimental cell.
+
+The unit of replication is the seed, not the episode: episodes of one trained agent are not
+independent evidence about its algorithm. The aggregates follow Agarwal, Schwarzer, Castro,
+Courville and Bellemare, "Deep Reinforcement Learning at the Edge of the Statistical Precipice",
+NeurIPS 2021: the interquartile mean (IQM), percentile bootstrap intervals and the probability of
+improvement. A cell is a single task, so their bootstrap stratified by task is here a plain
+bootstrap over seeds.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike
+from scipy import stats
+
+from rtd3jax.study.results import CELL
+
+TRIM = 0.25  # fraction of seeds cut from each side for the IQM
+CONFIDENCE = 0.95
+RESAMPLES = 2_000
+BOOTSTRAP_SEED = 0  # fixed: the same results always give the same interval
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Aggregates of one cell, in the units of its values (returns)."""
+
+    n: int  # seeds with a finite value
+    mean: float
+    std: float  # over seeds, ddof = 1; nan when n < 2
+    iqm: float
+    iqm_low: float  # bounds of the 95 % bootstrap interval; nan when n < 2
+    iqm_high: float
+    failed: int = 0  # seeds dropped because their value was not finite
+
+
+def seed_means(episodes: pd.DataFrame) -> pd.DataFrame:
+    """Average the EPISODES rows of each lane.
+
+    Returns one row per (cell, seed) with columns env, disturbance, algorithm, history_length,
+    seed, return and true_return (float64). A lane with any NaN episode has a NaN mean: averaging
+    only the episodes that survived would flatter a policy that sometimes diverges.
+    """
+    lanes = episodes.astype({"return": np.float64, "true_return": np.float64})
+    grouped = lanes.groupby([*CELL, "seed"], sort=True, as_index=False)
+    return grouped[["return", "true_return"]].mean(skipna=False)
+
+
+def summarise(values: ArrayLike) -> Summary:
+    """Summarise ``values`` [seeds], one number per seed; NaN and infinity mark a failed seed.
+
+    The IQM cuts ``floor(n / 4)`` seeds from each side, so that with n < 4 it equals the mean.
+    """
+    finite, failed = _finite(values)
+    n = finite.size
+    if n == 0:
+        return Summary(0, math.nan, math.nan, math.nan, math.nan, math.nan, failed)
+    low = high = std = math.nan
+    if n >= 2:
+        std = float(finite.std(ddof=1))
+        low, high = _bootstrap_interval(finite)
+    return Summary(n, float(finite.mean()), std, float(_iqm(finite)), low, high, failed)
+
+
+def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> float:
+    """Probability that a random seed of ``x`` [n] beats one of ``y`` [m]; a tie counts half.
+
+    This is the Mann-Whitney U statistic divided by n * m. Failed (non-finite) seeds are left out;
+    nan when either side has none left.
+    """
+    first, _ = _finite(x)
+    second, _ = _finite(y)
+    if first.size == 0 or second.size == 0:
+        return math.nan
+    wins = first[:, None] > second[None, :]
+    ties = first[:, None] == second[None, :]
+    return float(np.mean(wins + 0.5 * ties))
+
+
+def _finite(values: ArrayLike) -> tuple[np.ndarray, int]:
+    """The finite entries as float64 [n], and how many others there were."""
+    array = np.asarray(values, dtype=np.float64).ravel()
+    finite = array[np.isfinite(array)]
+    return finite, array.size - finite.size
+
+
+def _iqm(values: np.ndarray, axis: int = -1) -> np.ndarray:
+    return stats.trim_mean(values, TRIM, axis=axis)
+
+
+def _bootstrap_interval(values: np.ndarray) -> tuple[float, float]:
+    """95 % percentile bootstrap interval of the IQM of ``values`` [n >= 2]."""
+    # Sorted, because the resamples pick by position: the order of seeds must not matter.
+    result = stats.bootstrap(
+        (np.sort(values),),
+        _iqm,
+        n_resamples=RESAMPLES,
+        confidence_level=CONFIDENCE,
+        method="percentile",
+        vectorized=True,
+        rng=np.random.default_rng(BOOTSTRAP_SEED),
+    )
+    return float(result.confidence_interval.low), float(result.confidence_interval.high)

@@ -1,0 +1,159 @@
+"""The written summary of a study, as Markdown."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+
+from rtd3jax.study.results import CELL, REFERENCES
+from rtd3jax.study.statistics import Summary, seed_means, summarise
+
+MISSING = "missing"
+
+
+def summary_markdown(
+    config_lines: Mapping[str, object],
+    curves: pd.DataFrame,
+    episodes: pd.DataFrame,
+    failures: Sequence[Mapping],
+) -> str:
+    """Summarise a study.
+
+    ``config_lines`` maps setting names to values, shown in the order given. ``curves`` and
+    ``episodes`` have the columns of CURVES and EPISODES. Each of ``failures`` has the entries env,
+    disturbance, algorithm, history_length, seed, step and reason.
+
+    Every cell that occurs anywhere, even only in a failure, gets a row, so that a cell whose
+    seeds were all lost is seen as missing instead of silently left out.
+    """
+    lanes = seed_means(episodes)
+    lines = ["# Study summary", "", "## Configuration", ""]
+    lines += [f"- {_cell_text(name)}: {_cell_text(value)}" for name, value in config_lines.items()]
+    lines += ["", "## Final returns", ""]
+    lines += [
+        "Over seeds: mean ± standard deviation, and the interquartile mean (IQM) with its 95 % "
+        "bootstrap interval. Seeds are finished / started. Best IQM first. Reference policies "
+        "are not trained; their deviation is over episodes.",
+        "",
+    ]
+    started = _started_seeds(curves, lanes, failures)
+    tasks = {cell[:2] for cell in started}
+    tasks |= set(zip(lanes["env"], lanes["disturbance"], strict=True))
+    for task in sorted(tasks):
+        lines += _task_section(task, started, lanes, episodes)
+    if not tasks:
+        lines += ["No results.", ""]
+    lines += ["## Lanes lost", ""] + _failure_lines(failures)
+    return "\n".join(lines) + "\n"
+
+
+def _started_seeds(
+    curves: pd.DataFrame, lanes: pd.DataFrame, failures: Sequence[Mapping]
+) -> dict[tuple, set[int]]:
+    """The seeds seen anywhere, by cell (env, disturbance, algorithm, history length)."""
+    started: dict[tuple, set[int]] = {}
+    columns = [*CELL, "seed"]
+    for table in (curves[columns].drop_duplicates(), lanes[columns]):
+        for env, disturbance, algorithm, length, seed in table.itertuples(index=False):
+            if algorithm not in REFERENCES:
+                cell = (env, disturbance, algorithm, int(length))
+                started.setdefault(cell, set()).add(int(seed))
+    for failure in failures:
+        # An incomplete record still appears under "Lanes lost".
+        if all(name in failure for name in columns):
+            cell = tuple(failure[name] for name in CELL[:3]) + (int(failure["history_length"]),)
+            started.setdefault(cell, set()).add(int(failure["seed"]))
+    return started
+
+
+def _task_section(
+    task: tuple[str, str],
+    started: Mapping[tuple, set[int]],
+    lanes: pd.DataFrame,
+    episodes: pd.DataFrame,
+) -> list[str]:
+    """Heading and table of one (env, disturbance)."""
+    of_task = _select(lanes, task)
+    # The returns agree wherever the reward is not computed from disturbed quantities.
+    differs = not np.allclose(of_task["return"], of_task["true_return"], equal_nan=True)
+    header = ["algorithm", "l", "seeds", "mean ± std", "IQM [low, high]"]
+    header += ["true-state return"] if differs else []
+    lines = [f"### {_cell_text(task[0])}, {_cell_text(task[1])}", ""]
+    lines += [_row(header), _row(["---", "---:", "---:", "---:", "---:", "---:"][: len(header)])]
+
+    rows = []
+    for cell in started:
+        if cell[:2] != task:
+            continue
+        _, _, algorithm, length = cell
+        chosen = of_task["algorithm"].eq(algorithm) & of_task["history_length"].eq(length)
+        summary = summarise(of_task.loc[chosen, "return"])
+        true = summarise(of_task.loc[chosen, "true_return"])
+        seeds = f"{summary.n} / {len(started[cell])}"
+        if summary.n == 0:
+            entries = [algorithm, length, seeds, MISSING, MISSING]
+        else:
+            entries = [algorithm, length, seeds, _spread(summary), _interval(summary)]
+        entries += [_spread(true) if true.n else MISSING] if differs else []
+        order = (summary.n == 0, -summary.iqm if summary.n else 0.0, algorithm, length)
+        rows.append((order, entries))
+    lines += [_row(entries) for _, entries in sorted(rows, key=lambda row: row[0])]
+
+    for name in REFERENCES:
+        played = _select(episodes, task)
+        played = played[played["algorithm"] == name]
+        if len(played):
+            entries = [f"{name} (reference)", "–", "–", _spread(summarise(played["return"])), "–"]
+            entries += [_spread(summarise(played["true_return"]))] if differs else []
+            lines.append(_row(entries))
+    return [*lines, ""]
+
+
+def _failure_lines(failures: Sequence[Mapping]) -> list[str]:
+    """One list item per failed lane, in the order of cells, whatever order they failed in."""
+    if not failures:
+        return ["none"]
+    lines = []
+    for failure in failures:
+        get = {name: _cell_text(failure.get(name, "?")) for name in (*CELL, "seed", "step")}
+        lines.append(
+            f"- {get['env']}, {get['disturbance']}, {get['algorithm']}, "
+            f"l = {get['history_length']}, seed {get['seed']}, step {get['step']}: "
+            f"{_cell_text(failure.get('reason', 'reason unknown'))}"
+        )
+    return sorted(lines)
+
+
+def _select(table: pd.DataFrame, task: tuple[str, str]) -> pd.DataFrame:
+    return table[table["env"].eq(task[0]) & table["disturbance"].eq(task[1])]
+
+
+def _spread(summary: Summary) -> str:
+    if summary.n == 0:
+        return MISSING
+    if math.isnan(summary.std):
+        return _number(summary.mean)
+    return f"{_number(summary.mean)} ± {_number(summary.std)}"
+
+
+def _interval(summary: Summary) -> str:
+    if math.isnan(summary.iqm_low):
+        return _number(summary.iqm)
+    return f"{_number(summary.iqm)} [{_number(summary.iqm_low)}, {_number(summary.iqm_high)}]"
+
+
+def _number(value: float) -> str:
+    """Four significant digits, but no exponent below a million."""
+    if 100 <= abs(value) < 1e6:
+        return f"{value:.1f}"
+    return f"{value:.4g}"
+
+
+def _row(entries: Sequence[object]) -> str:
+    return "| " + " | ".join(_cell_text(entry) for entry in entries) + " |"
+
+
+def _cell_text(value: object) -> str:
+    """Text on one line that cannot end a table cell."""
+    return " ".join(str(value).split()).replace("|", "\\|")

@@ -1,0 +1,240 @@
+"""Environments by name; what is static and what is not."""
+
+import functools
+import itertools
+
+import gymnax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rtd3jax.envs import registry
+from rtd3jax.envs.disturbances import Sine
+from rtd3jax.envs.disturbed import Disturbed
+from rtd3jax.envs.registry import DISTURBANCES, ENVIRONMENTS, make, parse_disturbance, register
+from rtd3jax.errors import UserError, nearest
+
+ALL = [(env, disturbance) for env in ENVIRONMENTS for disturbance in DISTURBANCES[env]]
+
+
+def aval(tree):
+    return jax.tree.map(lambda x: (x.shape, str(x.dtype), bool(x.weak_type)), tree)
+
+
+@pytest.mark.parametrize(("env_id", "disturbance"), [*ALL, ("MountainCarContinuous-v0", "none")])
+def test_a_state_keeps_its_types_from_reset_to_step(env_id, disturbance):
+    env = make(env_id, disturbance)
+    key = jax.random.key(0)
+    action = jnp.zeros(env.action_space(env.default_params).shape)
+    first, state = jax.eval_shape(env.reset, key, env.default_params)
+    after, evolved, reward, *_ = jax.eval_shape(env.step, key, state, action, env.default_params)
+    assert aval(state) == aval(evolved)
+    assert aval(first) == aval(after)
+    assert not any(leaf.weak_type for leaf in jax.tree.leaves(state))
+    assert reward.shape == ()
+    assert reward.dtype == jnp.float32
+    inside = jax.eval_shape(env.reset_env, key, env.default_params)[1]
+    if env_id in ENVIRONMENTS:
+        assert aval(inside) == aval(state), "step_env and reset_env can be looped over too"
+
+
+def test_equal_structure_is_equal_whatever_the_numbers():
+    assert make("pendulum", "noise", sigma=0.1) == make("pendulum", "noise", sigma=2.0)
+    assert hash(make("pendulum", "noise", sigma=0.1)) == hash(make("pendulum", "noise"))
+    assert make("rover", "ar1-slip") == make("rover", "ar1-slip-fast", wheelbase=0.7)
+    assert make("PointRobot-misc") == make("PointRobot-misc", max_force=0.2)
+
+
+def test_different_structure_is_different():
+    envs = [
+        make("pendulum", "noise"),
+        make("pendulum", "noise", reward_from="state"),
+        make("rover"),
+        make("MountainCarContinuous-v0"),
+        make("PointRobot-misc"),
+        make("Pendulum-v1"),
+    ]
+    for one, other in itertools.combinations(envs, 2):
+        assert one != other
+    assert make("pendulum") != "pendulum"
+
+
+def test_transition_gradients_are_part_of_the_identity():
+    env = make("Pendulum-v1")
+    assert env.with_transition_gradients() != env
+    assert env.with_transition_gradients().default_params == env.default_params
+
+
+def test_equal_environments_share_a_program():
+    traces = []
+
+    @functools.partial(jax.jit, static_argnames="env")
+    def first(env, key, params):
+        traces.append(env)
+        return env.reset(key, params)[0]
+
+    for sigma in (0.1, 0.7):
+        env = make("pendulum", "noise", sigma=sigma)
+        first(env, jax.random.key(0), env.default_params)
+    assert len(traces) == 1
+    env = make("pendulum", "random-sine")
+    first(env, jax.random.key(0), env.default_params)
+    assert len(traces) == 2
+
+
+@pytest.mark.parametrize(
+    ("env_id", "disturbance", "name", "values"),
+    [
+        ("pendulum", "noise", "sigma", (0.0, 5.0)),
+        ("rover", "ar1-slip", "target_speed", (0.5, 0.1)),
+        ("PointRobot-misc", "none", "circle_radius", (1.0, 5.0)),
+    ],
+)
+def test_default_parameters_are_each_environments_own(env_id, disturbance, name, values):
+    """Inside gymnax's own jit the first of two equal environments would decide for both."""
+    key = jax.random.key(0)
+    firsts, afters = [], []
+    for value in values:
+        env = make(env_id, disturbance, **{name: value})
+        first, state = env.reset(key)
+        explicit, _ = env.reset(key, env.default_params)
+        np.testing.assert_array_equal(first, explicit)
+        action = jnp.zeros(env.action_space(env.default_params).shape)
+        after = env.step(key, state, action)[0]
+        np.testing.assert_array_equal(after, env.step(key, state, action, env.default_params)[0])
+        firsts.append(np.asarray(first))
+        afters.append(np.asarray(after))
+    assert np.max(np.abs(firsts[0] - firsts[1])) > 1e-2
+    assert np.max(np.abs(afters[0] - afters[1])) > 1e-2
+
+
+def test_parameters_go_to_the_process_then_to_the_environment():
+    params = make("pendulum", "temporal-bias", count=3, amplitude_max=2, g=9.81).default_params
+    assert (params.process.count, params.process.amplitude_max, params.env.g) == (3, 2.0, 9.81)
+    assert isinstance(params.process.amplitude_max, float)
+    assert make("pendulum", max_steps_in_episode=50).default_params.max_steps_in_episode == 50
+    params = make("rover", "ar1-slip", rho=0.5, wheelbase=1.0).default_params
+    assert (params.slip.rho, params.wheelbase) == (0.5, 1.0)
+    assert make("PointRobot-misc", dense_reward=True).default_params.dense_reward is True
+    assert make("pendulum", "random-sine", elements=1).default_params.process.elements == (1,)
+
+
+def test_variants_are_the_papers():
+    sigma_rho = {
+        name: (process.sigma, process.rho)
+        for name in DISTURBANCES["rover"]
+        if name.startswith("ar1")
+        for process in [make("rover", name).default_params.slip]
+    }
+    assert sigma_rho == {
+        "ar1-slip": (0.05, 0.95),
+        "ar1-slip-high-variance": (0.10, 0.95),
+        "ar1-slip-fast": (0.05, 0.90),
+        "ar1-slip-slow": (0.05, 0.98),
+    }
+    sine = make("pendulum", "temporal-sine").default_params.process
+    assert sine == Sine(1.0, 1.0, 70.0, 70.0, elements=(0, 1), waves=1)
+
+
+def test_only_noise_rewards_the_observation_by_default():
+    for disturbance in DISTURBANCES["pendulum"]:
+        env = make("pendulum", disturbance)
+        assert isinstance(env, Disturbed)
+        assert env.reward_from == ("observation" if disturbance == "noise" else "state")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parameters", "match"),
+    [
+        (("pendulm",), {}, "did you mean 'pendulum'"),
+        (("PointRobt-misc",), {}, "did you mean 'PointRobot-misc'"),
+        (("pendulum", "noisy"), {}, "did you mean 'noise'"),
+        (("rover", "noise"), {}, "unknown disturbance 'noise' of rover"),
+        (("pendulum", "noise"), {"sigm": 1.0}, "did you mean 'sigma'"),
+        (("pendulum", "noise"), {"reward_fron": "state"}, "did you mean 'reward_from'"),
+        (("pendulum", "noise"), {"reward_from": "stat"}, "did you mean 'state'"),
+        (("pendulum", "noise"), {"reward_from": 3}, "reward_from"),
+        (("pendulum", "noise"), {"sigma": "much"}, "sigma"),
+        (("pendulum", "noise"), {"sigma": True}, "sigma"),
+        (("pendulum", "noise"), {"sigma": float("nan")}, "sigma"),
+        (("pendulum", "noise"), {"sigma": -1}, "sigma"),
+        (("pendulum", "temporal-bias"), {"count": 2.5}, "count"),
+        (("pendulum", "temporal-bias"), {"elements": (0, 0.5)}, "elements"),
+        (("pendulum",), {"max_steps_in_episode": 0}, "max_steps_in_episode"),
+        (("pendulum",), {"dt": 0.0}, "dt"),
+        (("rover", "ar1-slip"), {"rho": 1.5}, "rho"),
+        (("rover", "ar1-slip"), {"slip": 1.0}, "slip"),
+        (("rover", "sine-slip"), {"period_min": 100}, "period_min"),
+        (("rover",), {"wheelbase": 0}, "wheelbase"),
+        (("rover",), {"reward_from": "state"}, "reward_from"),
+        (("PointRobot-misc", "noise"), {}, "noise"),
+        (("PointRobot-misc",), {"max_forc": 1.0}, "did you mean 'max_force'"),
+        (("PointRobot-misc",), {"dense_reward": 1}, "dense_reward"),
+    ],
+)
+def test_mistakes_are_named(arguments, parameters, match):
+    with pytest.raises(UserError, match=match) as caught:
+        make(*arguments, **parameters)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_gymnax_environment_is_gymnaxs():
+    ours, (theirs, params) = (
+        make("MountainCarContinuous-v0"),
+        gymnax.make("MountainCarContinuous-v0"),
+    )
+    assert isinstance(ours, type(theirs))
+    assert ours.name == theirs.name
+    key = jax.random.key(3)
+    observation, state = ours.reset(key)
+    after = ours.step(key, state, jnp.array([0.5]))
+    with jax.numpy_dtype_promotion("standard"):
+        expected, their_state = theirs.reset(key, params)
+        their_after = theirs.step(key, their_state, jnp.array([0.5]), params)
+    np.testing.assert_array_equal(observation, expected)
+    np.testing.assert_array_equal(after[0], their_after[0])
+    np.testing.assert_array_equal(after[2], their_after[2])
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("none", ("none", {})),
+        ("noise:", ("noise", {})),
+        (
+            "noise:sigma=1.0,reward_from=state",
+            ("noise", {"sigma": 1.0, "reward_from": "state"}),
+        ),
+        (
+            " random-sine: elements=(0, 1), waves = 2 ",
+            ("random-sine", {"elements": (0, 1), "waves": 2}),
+        ),
+    ],
+)
+def test_disturbances_are_parsed(text, expected):
+    assert parse_disturbance(text) == expected
+
+
+@pytest.mark.parametrize("text", ["", ":sigma=1", "noise:sigma", "noise:=1", "noise:a=1,a=2"])
+def test_malformed_disturbances_are_refused(text):
+    with pytest.raises(UserError):
+        parse_disturbance(text)
+
+
+def test_registered_environments_are_made(monkeypatch):
+    monkeypatch.setattr(registry, "_constructors", {})
+    register("mine", lambda disturbance, **parameters: (disturbance, parameters))
+    assert make("mine", "wind", speed=2) == ("wind", {"speed": 2})
+    with pytest.raises(UserError, match="did you mean 'mine'"):
+        make("mines")
+    for taken in ("mine", "pendulum", "Pendulum-v1"):
+        with pytest.raises(UserError, match="exists already"):
+            register(taken, lambda disturbance: None)
+    with pytest.raises(UserError, match="not callable"):
+        register("other", 3)
+
+
+def test_nearest_says_nothing_without_a_likeness():
+    assert nearest("sigm", ["sigma"]) == "; did you mean 'sigma'?"
+    assert nearest("xyz", ["sigma"]) == ""
