@@ -1,6 +1,27 @@
 """Recurrent TD3 agents for plants whose disturbance is hidden and evolves."""
 
+from rtd3jax.agents.networks import count_parameters
 from rtd3jax.config import ALGORITHMS, Config
+from rtd3jax.envs.registry import DISTURBANCES, ENVIRONMENTS, make, register
 from rtd3jax.errors import UserError
+from rtd3jax.evaluate import evaluate
+from rtd3jax.policy import Policy, constant_policy, random_policy
+from rtd3jax.training.run import Failure, Run, train
 
-__all__ = ["ALGORITHMS", "Config", "UserError"]
+__all__ = [
+    "ALGORITHMS",
+    "DISTURBANCES",
+    "ENVIRONMENTS",
+    "Config",
+    "Failure",
+    "Policy",
+    "Run",
+    "UserError",
+    "constant_policy",
+    "count_parameters",
+    "evaluate",
+    "make",
+    "random_policy",
+    "register",
+    "train",
+]

@@ -1,0 +1,205 @@
+"""TD3's targets, losses and updates (Fujimoto et al., 2018), over any of the six agents.
+
+Shapes: ``B`` batch, ``A`` action elements.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from rtd3jax.agents.networks import (
+    Params,
+    apply_network,
+    carry_before,
+    init_network,
+    part_sizes,
+)
+from rtd3jax.agents.replay import Batch
+from rtd3jax.agents.variants import Variant
+from rtd3jax.agents.windows import Window
+
+Critics = tuple[Params, Params]
+
+
+@struct.dataclass
+class Hyperparameters:
+    """The numbers in which lanes of one program may differ: float32 [] each, l int32 []."""
+
+    actor_learning_rate: jax.Array
+    critic_learning_rate: jax.Array
+    gamma: jax.Array
+    tau: jax.Array
+    exploration_noise: jax.Array
+    target_noise: jax.Array
+    target_noise_clip: jax.Array
+    history_length: jax.Array
+
+
+@struct.dataclass
+class Bounds:
+    """The action's range. ``low`` and ``high``: [A]."""
+
+    low: jax.Array
+    high: jax.Array
+
+    @property
+    def half_range(self) -> jax.Array:
+        """Half the distance between the bounds: [A]; the unit of the noise scales."""
+        return 0.5 * (self.high - self.low)
+
+    @property
+    def centre(self) -> jax.Array:
+        """The middle of the range: [A]."""
+        return 0.5 * (self.high + self.low)
+
+    def clip(self, action: jax.Array) -> jax.Array:
+        """``action`` [B, A] within the bounds."""
+        return jnp.clip(action, self.low[None, :], self.high[None, :])
+
+
+@struct.dataclass
+class Learner:
+    """Online and target networks, and Adam's moments."""
+
+    actor: Params
+    critics: Critics
+    target_actor: Params
+    target_critics: Critics
+    actor_optimizer: optax.OptState
+    critic_optimizer: optax.OptState
+
+
+_ADAM = optax.scale_by_adam()  # the learning rate is a lane's own number, applied in _descend
+
+
+def init_learner(
+    key: jax.Array, variant: Variant, observation_size: int, action_size: int, width: int
+) -> Learner:
+    """A learner whose targets equal its online networks."""
+    sizes = part_sizes(observation_size, action_size)
+    actor_key, first_key, second_key = jax.random.split(key, 3)
+    actor = init_network(actor_key, variant.actor, sizes, width, action_size)
+    critics = (
+        init_network(first_key, variant.critic, sizes, width, 1),
+        init_network(second_key, variant.critic, sizes, width, 1),
+    )
+    return Learner(
+        actor=actor,
+        critics=critics,
+        # Copies: a donated buffer must not appear twice.
+        target_actor=jax.tree.map(jnp.copy, actor),
+        target_critics=jax.tree.map(jnp.copy, critics),
+        actor_optimizer=_ADAM.init(actor),
+        critic_optimizer=_ADAM.init(critics),
+    )
+
+
+def act(params: Params, variant: Variant, window: Window, bounds: Bounds, carry=None) -> jax.Array:
+    """The deterministic action [B, A] of an actor: tanh, scaled to the bounds."""
+    output = apply_network(params, variant.actor, window, carry=carry)
+    return bounds.centre[None, :] + bounds.half_range[None, :] * jnp.tanh(output)
+
+
+def explore(key: jax.Array, action: jax.Array, noise: jax.Array, bounds: Bounds) -> jax.Array:
+    """``action`` [B, A] with Gaussian noise, ``noise`` half ranges wide, within the bounds."""
+    gaussian = jax.random.normal(key, action.shape, jnp.float32)
+    return bounds.clip(action + noise * bounds.half_range[None, :] * gaussian)
+
+
+def target(
+    learner: Learner,
+    variant: Variant,
+    batch: Batch,
+    key: jax.Array,
+    hyperparameters: Hyperparameters,
+    bounds: Bounds,
+) -> jax.Array:
+    """``y = r + gamma (1 - terminated) min_i Q'_i(next, smoothed target action)``: [B]."""
+    action = act(learner.target_actor, variant, batch.next_window, bounds)
+    noise = hyperparameters.target_noise * jax.random.normal(key, action.shape, jnp.float32)
+    clip = hyperparameters.target_noise_clip
+    noise = jnp.clip(noise, -clip, clip) * bounds.half_range[None, :]
+    action = bounds.clip(action + noise)
+    first, second = (
+        _value(critic, variant, batch.next_window, action, batch.next_carry)
+        for critic in learner.target_critics
+    )
+    bootstrap = jnp.where(batch.terminated, 0.0, jnp.minimum(first, second))
+    return batch.reward + hyperparameters.gamma * bootstrap
+
+
+def critic_loss(critics: Critics, variant: Variant, batch: Batch, y: jax.Array) -> jax.Array:
+    """Sum of the two critics' mean-squared errors against ``y`` [B]."""
+    # Two calls, not a vmap over the pair: faster on a CPU.
+    errors = (
+        _value(critic, variant, batch.window, batch.action, batch.carry) - y for critic in critics
+    )
+    return sum((jnp.mean(error**2) for error in errors), start=jnp.float32(0.0))
+
+
+def actor_loss(
+    actor: Params, critic: Params, variant: Variant, batch: Batch, bounds: Bounds
+) -> jax.Array:
+    """Minus the first critic's mean value of the actor's actions."""
+    action = act(actor, variant, batch.window, bounds)
+    carry = batch.carry
+    if carry is None and variant.critic.memory:
+        # No past token depends on the actor: the critic's prefix needs no tape.
+        carry = carry_before(critic, variant.critic, batch.window)
+    return -jnp.mean(_value(critic, variant, batch.window, action, carry))
+
+
+def update_critics(
+    learner: Learner,
+    variant: Variant,
+    batch: Batch,
+    key: jax.Array,
+    hyperparameters: Hyperparameters,
+    bounds: Bounds,
+) -> tuple[Learner, jax.Array]:
+    """One Adam step of both critics; the learner and the loss []."""
+    y = target(learner, variant, batch, key, hyperparameters, bounds)
+    loss, gradient = jax.value_and_grad(critic_loss)(learner.critics, variant, batch, y)
+    critics, optimizer = _descend(
+        learner.critics, gradient, learner.critic_optimizer, hyperparameters.critic_learning_rate
+    )
+    return dataclasses.replace(learner, critics=critics, critic_optimizer=optimizer), loss
+
+
+def update_actor_and_targets(
+    learner: Learner,
+    variant: Variant,
+    batch: Batch,
+    hyperparameters: Hyperparameters,
+    bounds: Bounds,
+) -> Learner:
+    """One Adam step of the actor, then Polyak averaging of all targets."""
+    gradient = jax.grad(actor_loss)(learner.actor, learner.critics[0], variant, batch, bounds)
+    actor, optimizer = _descend(
+        learner.actor, gradient, learner.actor_optimizer, hyperparameters.actor_learning_rate
+    )
+    tau = hyperparameters.tau
+
+    def average(online, target):
+        return jax.tree.map(lambda new, old: old + tau * (new - old), online, target)
+
+    return dataclasses.replace(
+        learner,
+        actor=actor,
+        actor_optimizer=optimizer,
+        target_actor=average(actor, learner.target_actor),
+        target_critics=average(learner.critics, learner.target_critics),
+    )
+
+
+def _value(critic: Params, variant: Variant, window: Window, action, carry) -> jax.Array:
+    return apply_network(critic, variant.critic, window, action, carry)[:, 0]
+
+
+def _descend(params, gradient, optimizer, learning_rate):
+    with jax.numpy_dtype_promotion("standard"):  # optax relies on it
+        direction, optimizer = _ADAM.update(gradient, optimizer)
+    return jax.tree.map(lambda p, d: p - learning_rate * d, params, direction), optimizer

@@ -1,0 +1,116 @@
+"""Deterministic evaluation of any policy on any environment."""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from rtd3jax.envs.interface import describe, foreign_code
+from rtd3jax.errors import UserError
+
+DEFAULT_STEP_LIMIT = 10_000
+"""Steps after which an episode is cut where the environment names no time limit of its own."""
+
+
+def evaluate(
+    policy: Any,
+    env: Any,
+    episodes: int = 100,
+    seed: int = 0,
+    *,
+    params: Any = None,
+    true_reward: bool = False,
+) -> jax.Array:
+    """Returns of whole episodes: float32 [episodes].
+
+    Args:
+        policy: anything with ``init`` and ``step``; see `rtd3jax.policy`.
+        env: a gymnax >= 1.0 environment.
+        episodes: how many, side by side.
+        seed: of the environment's streams; equal seeds meet equal episodes, whatever the policy.
+        params: the environment's parameters; its own by default.
+        true_reward: count the reward of the undisturbed state, where the environment gives it.
+
+    Raises:
+        UserError: for an unfit environment or impossible arguments.
+    """
+    for name, value, low in (("episodes", episodes, 1), ("seed", seed, 0)):
+        if isinstance(value, bool) or value != int(value) or not low <= value < 2**32:
+            raise UserError(f"{name} must be an integer of at least {low}, not {value!r}")
+    params = env.default_params if params is None else params
+    interface = describe(env, params)
+    expected = getattr(policy, "observation_size", interface.observation_size)
+    if expected != interface.observation_size:
+        raise UserError(
+            f"the policy expects {expected} observation elements, the environment gives "
+            f"{interface.observation_size}: evaluate it on the kind of world it was trained on"
+        )
+    action = getattr(policy, "action", None)
+    if action is not None and action.shape != (interface.action_size,):
+        raise UserError(
+            f"the constant action has {action.size} elements, "
+            f"the environment's has {interface.action_size}"
+        )
+    key = jax.random.key(int(seed))
+    returns, true_returns = _episode_returns(policy, env, params, key, int(episodes))
+    return true_returns if true_reward else returns
+
+
+@functools.partial(jax.jit, static_argnames=("env", "episodes"))
+def _episode_returns(policy, env, params, key, episodes):
+    return episode_returns(policy, env, params, key, episodes)
+
+
+def episode_returns(
+    policy: Any, env: Any, params: Any, key: jax.Array, episodes: int
+) -> tuple[jax.Array, jax.Array]:
+    """Returns of the trained and of the true reward, float32 [episodes] each; for use under jit."""
+    policy_key, reset_key, step_key = jax.random.split(key, 3)
+    with foreign_code():
+        observation, env_state = jax.vmap(env.reset, in_axes=(0, None))(
+            jax.random.split(reset_key, episodes), params
+        )
+    policy_state = jax.vmap(policy.init)(jax.random.split(policy_key, episodes))
+    limit = getattr(params, "max_steps_in_episode", DEFAULT_STEP_LIMIT)
+    zeros = jnp.zeros((episodes,), jnp.float32)
+
+    def unfinished(loop):
+        time, alive, *_ = loop
+        return jnp.any(alive) & (time < limit)
+
+    def step(loop):
+        time, alive, policy_state, env_state, observation, total, true_total = loop
+        action, policy_state = jax.vmap(policy.step)(policy_state, observation)
+        keys = jax.random.split(jax.random.fold_in(step_key, time), episodes)
+        with foreign_code():
+            observation, env_state, reward, terminated, truncated, info = jax.vmap(
+                env.step, in_axes=(0, 0, 0, None)
+            )(keys, env_state, action, params)
+        reward = reward.astype(jnp.float32)
+        true = info.get("true_reward", reward).astype(jnp.float32)
+        total = total + jnp.where(alive, reward, 0.0)
+        true_total = true_total + jnp.where(alive, true, 0.0)
+        alive = alive & ~(terminated.astype(bool) | truncated.astype(bool))
+        observation = observation.astype(jnp.float32)
+        return (
+            time + jnp.int32(1),
+            alive,
+            policy_state,
+            env_state,
+            observation,
+            total,
+            true_total,
+        )
+
+    start = (
+        jnp.int32(0),
+        jnp.ones((episodes,), bool),
+        policy_state,
+        env_state,
+        observation.astype(jnp.float32),
+        zeros,
+        zeros,
+    )
+    *_, total, true_total = jax.lax.while_loop(unfinished, step, start)
+    return total, true_total

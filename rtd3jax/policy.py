@@ -1,0 +1,139 @@
+"""Policies outside the trainer: the trained one, and the references that need no training.
+
+All share one interface: ``state = policy.init()``, then at each step
+``action, state = policy.step(state, observation)``.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from rtd3jax.agents.networks import Params
+from rtd3jax.agents.td3 import Bounds, act
+from rtd3jax.agents.variants import VARIANTS
+from rtd3jax.agents.windows import Steps, Window, empty_steps, past_tokens, put_step
+from rtd3jax.envs.interface import describe
+from rtd3jax.errors import UserError
+
+
+@struct.dataclass
+class PolicyState:
+    """What a policy remembers within an episode.
+
+    Attributes:
+        steps: ring of the last L steps.
+        previous_action: [A], zero before the first step.
+        time: int32 [], steps done in the episode.
+    """
+
+    steps: Steps
+    previous_action: jax.Array
+    time: jax.Array
+
+
+@struct.dataclass
+class Policy:
+    """A deterministic actor with its window; jittable and vmappable.
+
+    Attributes:
+        actor: the actor's parameters.
+        bounds: the action's range.
+        history_length: int32 [], l.
+        algorithm: the agent's id.
+        tokens: past tokens in the window's arrays, at least l.
+        observation_size: O.
+        action_shape: shape of the environment's action.
+    """
+
+    actor: Params
+    bounds: Bounds
+    history_length: jax.Array
+    algorithm: str = struct.field(pytree_node=False)
+    tokens: int = struct.field(pytree_node=False)
+    observation_size: int = struct.field(pytree_node=False)
+    action_shape: tuple[int, ...] = struct.field(pytree_node=False)
+
+    def init(self, key: jax.Array | None = None) -> PolicyState:
+        """The state before an episode's first step; ``key`` is not needed."""
+        action_size = self.bounds.low.shape[0]
+        return PolicyState(
+            steps=empty_steps(max(self.tokens, 1), self.observation_size, action_size),
+            previous_action=jnp.zeros((action_size,), jnp.float32),
+            time=jnp.int32(0),
+        )
+
+    def step(self, state: PolicyState, observation: jax.Array) -> tuple[jax.Array, PolicyState]:
+        """The action for ``observation`` [O], and the state that remembers both.
+
+        Raises:
+            UserError: when the observation has another size than those the policy was trained on.
+        """
+        observation = jnp.asarray(observation, jnp.float32)
+        if observation.shape != (self.observation_size,):
+            raise UserError(
+                f"the policy expects observations of shape ({self.observation_size},), "
+                f"not {observation.shape}: it was trained on another environment"
+            )
+        time = state.time[None]
+        past, length = past_tokens(state.steps, time, time, state.time, self.tokens)
+        window = Window(
+            past=past,
+            length=jnp.minimum(length, self.history_length),
+            observation=observation[None],
+            previous_action=state.previous_action[None],
+        )
+        action = act(self.actor, VARIANTS[self.algorithm], window, self.bounds)[0]
+        steps = put_step(state.steps, state.time, Steps(observation, state.previous_action, action))
+        state = PolicyState(steps, action, state.time + jnp.int32(1))
+        return action.reshape(self.action_shape), state
+
+
+@struct.dataclass
+class ConstantPolicy:
+    """Always the same action [A]."""
+
+    action: jax.Array
+
+    def init(self, key: jax.Array | None = None) -> tuple:
+        """No state."""
+        return ()
+
+    def step(self, state: tuple, observation: jax.Array) -> tuple[jax.Array, tuple]:
+        """The constant action."""
+        return self.action, state
+
+
+@struct.dataclass
+class RandomPolicy:
+    """Uniform within the action's bounds."""
+
+    bounds: Bounds
+    action_shape: tuple[int, ...] = struct.field(pytree_node=False)
+
+    def init(self, key: jax.Array | None = None) -> jax.Array:
+        """The stream of random numbers; ``key`` starts it (default: a fixed one)."""
+        return jax.random.key(0) if key is None else key
+
+    def step(self, state: jax.Array, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """A uniform action, and the next state of the stream."""
+        key, state = jax.random.split(state)
+        low, high = self.bounds.low, self.bounds.high
+        action = jax.random.uniform(key, low.shape, jnp.float32, low, high)
+        return action.reshape(self.action_shape), state
+
+
+def constant_policy(action: Any) -> ConstantPolicy:
+    """The policy that always does ``action``: a number or [A] in the environment's units."""
+    array = jnp.atleast_1d(jnp.asarray(action, jnp.float32))
+    if not bool(jnp.all(jnp.isfinite(array))):
+        raise UserError(f"a constant policy needs finite actions, not {action!r}")
+    return ConstantPolicy(array)
+
+
+def random_policy(env: Any, params: Any = None) -> RandomPolicy:
+    """The uniform-random policy of ``env``: the floor of every table."""
+    interface = describe(env, env.default_params if params is None else params)
+    bounds = Bounds(jnp.asarray(interface.action_low), jnp.asarray(interface.action_high))
+    return RandomPolicy(bounds, interface.action_shape)

@@ -1,0 +1,1 @@
+"""From one lane to many."""

@@ -1,0 +1,234 @@
+"""Lanes over devices: which device runs which group of lanes, and for how many steps.
+
+A *group* is what one call of a compiled program advances: on a CPU a single lane, so that a lane's
+numbers cannot depend on its company and no product is split over threads; on an accelerator as
+many lanes as there are, under ``vmap``, because there width is nearly free. Each device has a
+worker that takes the group that lags most, so that five lanes keep two cores equally busy.
+"""
+
+import dataclasses
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rtd3jax.training.loop import HEALTHY, Lane, LaneState, Program
+
+CHUNK_SECONDS = 1.0
+"""Wall time at which a chunk aims: the pace of progress, and the wait after Ctrl-C."""
+
+_FIRST_CHUNK = 32
+
+
+@dataclasses.dataclass(eq=False)
+class Job:
+    """One lane to be trained: its program, its numbers, and who it is to its owner.
+
+    Attributes:
+        program: what is compiled.
+        lane: the numbers.
+        owner: anything; the key under which results are filed.
+    """
+
+    program: Program
+    lane: Lane
+    owner: Any
+
+
+@dataclasses.dataclass(eq=False)
+class Group:
+    """Jobs that advance together, and how far they are.
+
+    Attributes:
+        jobs: of one program.
+        state: of all lanes, with a leading axis where there are several; None before the start.
+        step: steps done.
+        returns: the curves so far on the host, [lanes, K]: ``state`` may be in use on a device.
+        lost: whether every lane has failed.
+        error: what a failed group raised.
+    """
+
+    jobs: list[Job]
+    state: LaneState | None = None
+    step: int = 0
+    returns: np.ndarray | None = None
+    lost: bool = False
+    error: BaseException | None = None
+
+    @property
+    def total(self) -> int:
+        """Steps to be done."""
+        return self.jobs[0].program.config.total_steps
+
+    @property
+    def finished(self) -> bool:
+        """Whether nothing is left to do: done, failed, or every lane lost."""
+        return self.error is not None or self.step >= self.total or self.lost
+
+    def lanes(self) -> Iterator[tuple[Job, LaneState]]:
+        """Each job with its lane's state."""
+        assert self.state is not None
+        if len(self.jobs) == 1:
+            yield self.jobs[0], self.state
+            return
+        for index, job in enumerate(self.jobs):
+            yield job, jax.tree.map(lambda leaf, i=index: leaf[i], self.state)
+
+
+def default_strategy() -> str:
+    """``map`` on CPUs, ``vmap`` on accelerators."""
+    return "map" if jax.default_backend() == "cpu" else "vmap"
+
+
+def make_groups(jobs: Sequence[Job], strategy: str, devices: int) -> list[Group]:
+    """Groups of one lane (``map``), or one group per program and device (``vmap``)."""
+    if strategy == "map":
+        return [Group([job]) for job in jobs]
+    by_program: dict[Any, list[Job]] = {}
+    for job in jobs:
+        by_program.setdefault((job.program, _structure(job.lane)), []).append(job)
+    return [
+        Group(members[start::devices])
+        for members in by_program.values()
+        for start in range(min(devices, len(members)))
+    ]
+
+
+def advance_groups(
+    groups: Sequence[Group],
+    on_chunk: Callable[[Group], None],
+    devices: Sequence[Any] | None = None,
+) -> None:
+    """Advance every group to its end, calling ``on_chunk`` in this thread after each chunk.
+
+    A group that raises keeps its error and does not touch the others. An interrupt stops the
+    workers after their current chunks and is raised again.
+    """
+    devices = list(devices or jax.local_devices())
+    pool = _Pool(groups)
+    workers = [
+        threading.Thread(target=_work, args=(pool, device), daemon=True)
+        for device in devices[: max(1, len(groups))]
+    ]
+    for worker in workers:
+        worker.start()
+    try:
+        for group in pool.events():
+            on_chunk(group)
+    finally:
+        pool.stop()
+        for worker in workers:
+            worker.join()
+
+
+class _Pool:
+    """The groups that workers share; every method is safe to call from any thread."""
+
+    def __init__(self, groups: Sequence[Group]):
+        self._idle = [group for group in groups if not group.finished]
+        self._busy = 0
+        self._events: list[Group] = []
+        self._stopped = False
+        self._changed = threading.Condition()
+
+    def take(self) -> Group | None:
+        """The idle group with the least done; None when there will be none for this worker."""
+        with self._changed:
+            while not self._idle and self._busy and not self._stopped:
+                self._changed.wait()
+            if not self._idle or self._stopped:
+                return None
+            # min() keeps the order of the jobs among equals: cells finish one after another.
+            group = min(self._idle, key=lambda g: g.step / g.total)
+            self._idle.remove(group)
+            self._busy += 1
+            return group
+
+    def give_back(self, group: Group) -> None:
+        with self._changed:
+            self._busy -= 1
+            if not group.finished:
+                self._idle.append(group)
+            self._events.append(group)
+            self._changed.notify_all()
+
+    def events(self) -> Iterator[Group]:
+        """Groups as their chunks end, until all are finished."""
+        while True:
+            with self._changed:
+                while not self._events:
+                    if not self._idle and not self._busy:
+                        return
+                    # A timeout, so that an interrupt reaches the main thread.
+                    self._changed.wait(timeout=0.2)
+                group = self._events.pop(0)
+            yield group
+
+    def stop(self) -> None:
+        with self._changed:
+            self._stopped = True
+            self._changed.notify_all()
+
+
+def _work(pool: _Pool, device: Any) -> None:
+    """A device's worker: chunks of the lagging group, as long as there is one."""
+    rates: dict[Any, float] = {}
+    while (group := pool.take()) is not None:
+        try:
+            _chunk(group, device, rates)
+        except BaseException as error:  # contained: the others go on
+            group.error = error
+        pool.give_back(group)
+
+
+def _chunk(group: Group, device: Any, rates: dict[Any, float]) -> None:
+    program, width = group.jobs[0].program, len(group.jobs)
+    lanes = [job.lane for job in group.jobs]
+    lane = lanes[0] if width == 1 else jax.tree.map(lambda *leaves: jnp.stack(leaves), *lanes)
+    lane = jax.device_put(lane, device)
+    init, advance = _compiled(program, width > 1)
+    state = init(lane) if group.state is None else jax.device_put(group.state, device)
+    rate = rates.get((program, width))
+    steps = _FIRST_CHUNK if rate is None else max(1, int(rate * CHUNK_SECONDS))
+    # Before learning starts steps are cheap: a chunk that crosses over would be far too long.
+    warm_up = program.config.learning_starts
+    stop = min(group.step + steps, group.total)
+    if group.step < warm_up:
+        stop = min(warm_up, group.total)
+    began = time.perf_counter()
+    state = advance(lane, state, jnp.int32(group.step), jnp.int32(stop))
+    jax.block_until_ready(state)
+    seconds = time.perf_counter() - began
+    if group.step >= warm_up:
+        rates[program, width] = (stop - group.step) / seconds
+    group.returns = np.atleast_2d(np.asarray(state.returns))
+    group.lost = bool(np.all(np.asarray(state.failure) != HEALTHY))
+    group.state, group.step = state, stop
+
+
+_programs: dict[Any, tuple[Any, Any]] = {}
+_programs_lock = threading.Lock()
+
+
+def _compiled(program: Program, batched: bool) -> tuple[Any, Any]:
+    """``init`` and ``advance`` under jit, the same objects for equal programs."""
+    with _programs_lock:
+        if (program, batched) not in _programs:
+            init, advance = program.init, program.advance
+            if batched:
+                init = jax.vmap(init)
+                advance = jax.vmap(advance, in_axes=(0, 0, None, None))
+            _programs[program, batched] = (
+                jax.jit(init),
+                jax.jit(advance, donate_argnums=1),
+            )
+        return _programs[program, batched]
+
+
+def _structure(lane: Lane) -> Any:
+    shapes = tuple((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(lane))
+    return jax.tree.structure(lane), shapes

@@ -1,0 +1,181 @@
+"""`train`: seeds of one configuration on one environment; the library's main call."""
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rtd3jax.config import Config
+from rtd3jax.envs.interface import describe
+from rtd3jax.errors import UserError
+from rtd3jax.policy import Policy
+from rtd3jax.training.lanes import Group, Job, advance_groups, default_strategy, make_groups
+from rtd3jax.training.loop import (
+    ENVIRONMENT_NOT_FINITE,
+    HEALTHY,
+    LOSS_NOT_FINITE,
+    LaneState,
+    make_lane,
+    make_program,
+)
+from rtd3jax.training.progress import Progress
+
+_REASONS = {
+    ENVIRONMENT_NOT_FINITE: "the environment gave an observation or reward that is not finite; "
+    "check its step function",
+    LOSS_NOT_FINITE: "the critics' loss is not finite; lower actor_learning_rate and "
+    "critic_learning_rate",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Failure:
+    """A lane that was lost: at which step, and why. ``step`` is -1 where it is not known."""
+
+    seed: int
+    step: int
+    reason: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """What `train` gives.
+
+    Attributes:
+        config: what was trained.
+        seeds: of the lanes, in the order asked for.
+        eval_steps: int64 [K], environment steps at each evaluation.
+        returns: float32 [seeds, K], mean return of an evaluation's episodes; NaN after a lane
+            was lost.
+        true_returns: the same of the undisturbed state's reward.
+        failures: the lanes that were lost.
+    """
+
+    config: Config
+    seeds: tuple[int, ...]
+    eval_steps: np.ndarray
+    returns: np.ndarray
+    true_returns: np.ndarray
+    failures: tuple[Failure, ...]
+    _policies: tuple[Policy | None, ...] = dataclasses.field(repr=False)
+
+    def policy(self, seed: int) -> Policy:
+        """The trained policy of ``seed``."""
+        if seed not in self.seeds:
+            raise UserError(f"seed {seed} was not trained; the seeds are {list(self.seeds)}")
+        policy = self._policies[self.seeds.index(seed)]
+        if policy is None:
+            raise UserError(f"seed {seed} was lost in training: {self._failure(seed).reason}")
+        return policy
+
+    def _failure(self, seed: int) -> Failure:
+        return next(failure for failure in self.failures if failure.seed == seed)
+
+
+def train(
+    env: Any,
+    config: Config,
+    seeds: Iterable[int] = range(5),
+    *,
+    params: Any = None,
+    progress: bool = True,
+    strategy: str | None = None,
+) -> Run:
+    """Train one lane per seed.
+
+    Args:
+        env: a gymnax >= 1.0 environment with a bounded Box of actions.
+        config: of the agent.
+        seeds: distinct integers of at least 0; a seed's result does not depend on the others.
+        params: the environment's parameters; its own by default.
+        progress: whether to show a bar.
+        strategy: ``map`` (lanes one by one, each on one core) or ``vmap`` (side by side); by
+            default what suits the backend.
+
+    Raises:
+        UserError: for an unfit environment or impossible arguments, before anything is compiled.
+    """
+    seeds = check_seeds(seeds)
+    jobs = make_jobs(env, config, seeds, params=params)
+    groups = make_groups(jobs, check_strategy(strategy), len(jax.local_devices()))
+    label = f"{config.algorithm} l={config.history_length}"
+    with Progress(groups, lambda job: label, enabled=progress) as bar:
+        advance_groups(groups, bar.update)
+    return collect(config, seeds, groups)
+
+
+def make_jobs(
+    env: Any, config: Config, seeds: Sequence[int], *, params: Any = None, cell: Any = None
+) -> list[Job]:
+    """A job per seed, owned by ``(cell, seed)``; checks the environment."""
+    params = env.default_params if params is None else params
+    interface = describe(env, params)
+    program = make_program(env, config, interface.observation_size, interface.action_shape)
+    return [Job(program, make_lane(config, seed, params), (cell, seed)) for seed in seeds]
+
+
+def collect(config: Config, seeds: Sequence[int], groups: Iterable[Group]) -> Run:
+    """The run of these seeds from groups that have ended; an error of a whole group is raised."""
+    found: dict[int, tuple[Job, LaneState]] = {}
+    for group in groups:
+        if group.error is not None:
+            raise group.error
+        found.update({job.owner[1]: (job, state) for job, state in group.lanes()})
+    evaluations = next(iter(found.values()))[0].program.evaluations
+    steps = np.minimum(
+        np.arange(1, evaluations + 1, dtype=np.int64) * config.eval_every, config.total_steps
+    )
+    failures, policies, returns, true_returns = [], [], [], []
+    for seed in seeds:
+        job, state = found[seed]
+        failure = failure_of(seed, state)
+        returns.append(_curve(state.returns, steps, failure))
+        true_returns.append(_curve(state.true_returns, steps, failure))
+        policies.append(None if failure else job.program.policy(job.lane, state.learner.actor))
+        failures += [failure] if failure else []
+    return Run(
+        config,
+        tuple(seeds),
+        steps,
+        np.stack(returns),
+        np.stack(true_returns),
+        tuple(failures),
+        tuple(policies),
+    )
+
+
+def failure_of(seed: int, state: LaneState) -> Failure | None:
+    """What became of a lane, if it was lost."""
+    code = int(state.failure)
+    if code == HEALTHY:
+        return None
+    return Failure(seed, int(state.failed_at), _REASONS[code])
+
+
+def check_seeds(seeds: Iterable[int]) -> tuple[int, ...]:
+    """Distinct integers in 0..2**32-1, at least one."""
+    seeds = tuple(seeds)
+    for seed in seeds:
+        if isinstance(seed, bool) or seed != int(seed) or not 0 <= seed < 2**32:
+            raise UserError(f"seeds must be integers from 0 to 2**32 - 1, not {seed!r}")
+    if not seeds or len(set(seeds)) < len(seeds):
+        raise UserError(f"seeds must be distinct and at least one, not {list(seeds)}")
+    return tuple(int(seed) for seed in seeds)
+
+
+def check_strategy(strategy: str | None) -> str:
+    """The strategy, or the backend's own."""
+    if strategy not in (None, "map", "vmap"):
+        raise UserError(f"strategy must be 'map' or 'vmap', not {strategy!r}")
+    return strategy or default_strategy()
+
+
+def _curve(values: jax.Array, steps: np.ndarray, failure: Failure | None) -> np.ndarray:
+    """A lane's curve [K]; nothing after its loss counts."""
+    curve = np.array(jnp.asarray(values))
+    if failure is not None:
+        curve[steps > failure.step] = np.nan
+    return curve

@@ -1,0 +1,131 @@
+"""Every sampled window, mask, next window and stored carry, against a slow numpy oracle."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rtd3jax.agents.lstm import Carry
+from rtd3jax.agents.replay import (
+    Transition,
+    empty_replay,
+    gather,
+    put_carry,
+    put_transition,
+    sample,
+)
+from rtd3jax.agents.windows import Steps
+
+
+def _history(lengths):
+    """Rows of whole episodes; every number in them tells where it comes from."""
+    rows, number = [], 0
+    for episode, length in enumerate(lengths):
+        for age in range(length):
+            rows.append(
+                dict(
+                    observation=[episode, age],
+                    previous_action=[100 * episode + age - 1 if age else 0.0],
+                    action=[100 * episode + age],
+                    next_observation=[episode, age + 1],
+                    age=age,
+                    terminated=age == length - 1 and episode % 2 == 0,
+                    reward=number,
+                )
+            )
+            number += 1
+    return rows
+
+
+def _store(rows, capacity):
+    """Write the rows, and carries as the loop does: before each step; after each end."""
+    replay = empty_replay(capacity, 2, 1, carry_width=1)
+    for number, row in enumerate(rows):
+        if row["age"]:
+            replay = put_carry(replay, jnp.int32(number), _carry(row["observation"]))
+        array = {k: jnp.asarray(v, jnp.float32) for k, v in row.items()}
+        replay = put_transition(
+            replay,
+            jnp.int32(number),
+            Transition(
+                step=Steps(array["observation"], array["previous_action"], array["action"]),
+                reward=array["reward"],
+                next_observation=array["next_observation"],
+                terminated=jnp.asarray(row["terminated"]),
+                age=jnp.int32(row["age"]),
+            ),
+        )
+        replay = put_carry(replay, jnp.int32(number + 1), _carry(row["next_observation"]))
+    return replay
+
+
+def _carry(observation):
+    """A carry that names the observation before which it stands."""
+    value = jnp.asarray([10_000.0 * observation[0] + observation[1]], jnp.float32)
+    return Carry(value, -value)
+
+
+def _oracle_past(rows, number, capacity, history_length, last):
+    """Indices of the past tokens of row ``number``; ``last`` is the newest row written."""
+    oldest = max(0, last + 1 - capacity)
+    episode = rows[number]["observation"][0]
+    return [
+        k
+        for k in range(number - history_length, number)
+        if k >= oldest and rows[k]["observation"][0] == episode
+    ]
+
+
+@given(
+    lengths=st.lists(st.integers(1, 7), min_size=1, max_size=8),
+    capacity=st.integers(3, 40),
+    tokens=st.integers(0, 5),
+    less=st.integers(0, 2),
+)
+def test_windows_and_carries_equal_the_oracle(lengths, capacity, tokens, less):
+    history_length = max(tokens - less, 0)
+    rows = _history(lengths)
+    replay = _store(rows, capacity)
+    count = len(rows)
+    kept = np.arange(max(0, count - capacity), count)
+    batch = gather(
+        replay, jnp.asarray(kept, jnp.int32), jnp.int32(count), tokens, jnp.int32(history_length)
+    )
+    for b, number in enumerate(kept):
+        row = rows[number]
+        past = _oracle_past(rows, number, capacity, history_length, count - 1)
+        after = [*past, number][-history_length:] if history_length else []
+        current = dict(observation=row["observation"], previous_action=row["previous_action"])
+        following = dict(observation=row["next_observation"], previous_action=row["action"])
+        for window, indices, now in (
+            (batch.window, past, current),
+            (batch.next_window, after, following),
+        ):
+            exists = np.asarray(window.exists)[:, b]
+            assert exists.sum() == len(indices) == int(window.length[b])
+            assert not np.any(exists[: tokens - len(indices)])
+            for part in ("observation", "previous_action", "action"):
+                got = np.asarray(getattr(window.past, part))[tokens - len(indices) :, b]
+                want = [rows[k][part] for k in indices]
+                assert got.tolist() == want
+            for part, want in now.items():
+                assert np.asarray(getattr(window, part))[b].tolist() == list(want)
+        assert float(batch.reward[b]) == row["reward"]
+        assert bool(batch.terminated[b]) == row["terminated"]
+        carry = _carry(row["observation"]) if row["age"] else Carry(jnp.zeros(1), jnp.zeros(1))
+        for got, want in (
+            (batch.carry, carry),
+            (batch.next_carry, _carry(row["next_observation"])),
+        ):
+            assert float(got.hidden[b, 0]) == float(want.hidden[0])
+            assert float(got.cell[b, 0]) == float(want.cell[0])
+
+
+def test_samples_are_uniform_over_the_rows_kept():
+    rows = _history([5, 5, 5])
+    replay = _store(rows, capacity=8)
+    batch = sample(replay, jax.random.key(0), jnp.int32(15), 8_000, 2, 2)
+    numbers, counts = np.unique(np.asarray(batch.reward), return_counts=True)
+    assert numbers.tolist() == list(range(7, 15))
+    assert np.all(np.abs(counts - 1_000) < 150)

@@ -1,0 +1,92 @@
+"""The trainer's contracts: determinism, independence of lanes, lengths side by side."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+import rtd3jax as rtd
+
+TINY = rtd.Config(
+    algorithm="lstm-td3-1ha1hc",
+    history_length=2,
+    total_steps=260,
+    hidden_size=8,
+    batch_size=8,
+    learning_starts=20,
+    eval_every=100,
+    eval_episodes=2,
+)
+
+
+def _rover():
+    return rtd.make("rover", disturbance="ar1-slip")
+
+
+def _train(algorithm=TINY.algorithm, seeds=(3,), env=None, **changes):
+    length = None if algorithm == "td3" else changes.pop("history_length", 2)
+    config = dataclasses.replace(TINY, algorithm=algorithm, history_length=length, **changes)
+    return rtd.train(env or _rover(), config, seeds, progress=False)
+
+
+def _same(a, b):
+    return all(
+        np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    )
+
+
+@pytest.mark.parametrize("algorithm", rtd.ALGORITHMS)
+def test_every_agent_trains_and_its_policy_plays(algorithm):
+    env = _rover()
+    run = _train(algorithm, env=env)
+    assert run.returns.shape == (1, 3) and np.all(np.isfinite(run.returns))
+    assert run.eval_steps.tolist() == [100, 200, 260]
+    assert not run.failures
+    returns = rtd.evaluate(run.policy(3), env, episodes=2, seed=7)
+    assert returns.shape == (2,) and returns.dtype == np.float32
+
+
+def test_the_same_call_twice_gives_the_same_bits():
+    first, second = _train("h-td3"), _train("h-td3")
+    np.testing.assert_array_equal(first.returns, second.returns)
+    assert _same(first.policy(3).actor, second.policy(3).actor)
+
+
+def test_a_seed_does_not_depend_on_its_company():
+    alone, among = _train(seeds=[3]), _train(seeds=range(5))
+    np.testing.assert_array_equal(alone.returns[0], among.returns[3])
+    assert _same(alone.policy(3).actor, among.policy(3).actor)
+    assert not _same(among.policy(2).actor, among.policy(3).actor)
+    assert len(np.unique(among.returns[:, 0])) == 5
+
+
+def test_vmap_agrees_with_map():
+    config = dataclasses.replace(TINY, total_steps=60, eval_every=30)
+    runs = [
+        rtd.train(_rover(), config, [0, 1], progress=False, strategy=s) for s in ("map", "vmap")
+    ]
+    np.testing.assert_allclose(runs[0].returns, runs[1].returns, rtol=1e-3)
+
+
+def test_a_lost_lane_is_reported_and_does_not_touch_the_others():
+    lost = _train(critic_learning_rate=1e30, seeds=[0])
+    assert np.isnan(lost.returns[0, -1])
+    assert "loss is not finite" in lost.failures[0].reason
+    with pytest.raises(rtd.UserError, match="seed 0 was lost"):
+        lost.policy(0)
+
+
+@pytest.mark.parametrize("env_id", ["MountainCarContinuous-v0", "PointRobot-misc"])
+def test_gymnax_environments_train_without_glue(env_id):
+    import gymnax
+
+    env, _ = gymnax.make(env_id)
+    run = _train(env=env, total_steps=60, eval_every=60, eval_episodes=1)
+    assert np.all(np.isfinite(run.returns))
+
+
+@pytest.mark.parametrize("seeds", [[], [1, 1], [-1], [0.5]])
+def test_bad_seeds_are_refused(seeds):
+    with pytest.raises(rtd.UserError, match="seeds must be"):
+        rtd.train(_rover(), TINY, seeds, progress=False)
