@@ -6,7 +6,9 @@ many lanes as there are, under ``vmap``, because there width is nearly free. Eac
 worker that takes the group that lags most, so that five lanes keep two cores equally busy.
 """
 
+import contextlib
 import dataclasses
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -31,7 +33,7 @@ class Job:
     Attributes:
         program: what is compiled.
         lane: the numbers.
-        owner: anything; the key under which results are filed.
+        owner: (cell, seed); jobs of one cell stand together in a list of jobs.
     """
 
     program: Program
@@ -84,6 +86,16 @@ def default_strategy() -> str:
     return "map" if jax.default_backend() == "cpu" else "vmap"
 
 
+def use_all_cores() -> None:
+    """One CPU device per core, if JAX has not started yet and nobody has chosen otherwise."""
+    if jax.config.jax_num_cpu_devices > 0 or "host_platform_device_count" in os.environ.get(
+        "XLA_FLAGS", ""
+    ):
+        return
+    with contextlib.suppress(RuntimeError):  # raised where the backend has started
+        jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
+
+
 def make_groups(jobs: Sequence[Job], strategy: str, devices: int) -> list[Group]:
     """Groups of one lane (``map``), or one group per program and device (``vmap``)."""
     if strategy == "map":
@@ -131,6 +143,8 @@ class _Pool:
     def __init__(self, groups: Sequence[Group]):
         self._idle = [group for group in groups if not group.finished]
         self._busy = 0
+        cells = list(dict.fromkeys(id(group.jobs[0].owner[0]) for group in groups))
+        self._rank = {id(group): cells.index(id(group.jobs[0].owner[0])) for group in groups}
         self._events: list[Group] = []
         self._stopped = False
         self._changed = threading.Condition()
@@ -142,8 +156,9 @@ class _Pool:
                 self._changed.wait()
             if not self._idle or self._stopped:
                 return None
-            # min() keeps the order of the jobs among equals: cells finish one after another.
-            group = min(self._idle, key=lambda g: g.step / g.total)
+            # Cell after cell, so that results come early and few replays are held at once;
+            # within a cell the group that lags most.
+            group = min(self._idle, key=lambda g: (self._rank[id(g)], g.step))
             self._idle.remove(group)
             self._busy += 1
             return group

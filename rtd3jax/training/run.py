@@ -5,14 +5,20 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from rtd3jax.config import Config
 from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
 from rtd3jax.policy import Policy
-from rtd3jax.training.lanes import Group, Job, advance_groups, default_strategy, make_groups
+from rtd3jax.training.lanes import (
+    Group,
+    Job,
+    advance_groups,
+    default_strategy,
+    make_groups,
+    use_all_cores,
+)
 from rtd3jax.training.loop import (
     ENVIRONMENT_NOT_FINITE,
     HEALTHY,
@@ -99,6 +105,7 @@ def train(
         UserError: for an unfit environment or impossible arguments, before anything is compiled.
     """
     seeds = check_seeds(seeds)
+    use_all_cores()
     jobs = make_jobs(env, config, seeds, params=params)
     groups = make_groups(jobs, check_strategy(strategy), len(jax.local_devices()))
     label = f"{config.algorithm} l={config.history_length}"
@@ -124,16 +131,14 @@ def collect(config: Config, seeds: Sequence[int], groups: Iterable[Group]) -> Ru
         if group.error is not None:
             raise group.error
         found.update({job.owner[1]: (job, state) for job, state in group.lanes()})
-    evaluations = next(iter(found.values()))[0].program.evaluations
-    steps = np.minimum(
-        np.arange(1, evaluations + 1, dtype=np.int64) * config.eval_every, config.total_steps
-    )
+    steps = evaluation_steps(config)
     failures, policies, returns, true_returns = [], [], [], []
     for seed in seeds:
         job, state = found[seed]
         failure = failure_of(seed, state)
-        returns.append(_curve(state.returns, steps, failure))
-        true_returns.append(_curve(state.true_returns, steps, failure))
+        curve, true_curve = curves_of(config, state, failure)
+        returns.append(curve)
+        true_returns.append(true_curve)
         policies.append(None if failure else job.program.policy(job.lane, state.learner.actor))
         failures += [failure] if failure else []
     return Run(
@@ -173,9 +178,19 @@ def check_strategy(strategy: str | None) -> str:
     return strategy or default_strategy()
 
 
-def _curve(values: jax.Array, steps: np.ndarray, failure: Failure | None) -> np.ndarray:
-    """A lane's curve [K]; nothing after its loss counts."""
-    curve = np.array(jnp.asarray(values))
-    if failure is not None:
-        curve[steps > failure.step] = np.nan
-    return curve
+def evaluation_steps(config: Config) -> np.ndarray:
+    """Environment steps done at each evaluation: int64 [K]; the last is the end."""
+    count = -(-config.total_steps // config.eval_every)
+    return np.minimum(np.arange(1, count + 1) * config.eval_every, config.total_steps)
+
+
+def curves_of(
+    config: Config, state: LaneState, failure: Failure | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """A lane's returns and true returns [K]; nothing after its loss counts."""
+    lost = evaluation_steps(config) > (np.inf if failure is None else failure.step)
+    returns, true_returns = (
+        np.where(lost, np.float32(np.nan), np.asarray(curve))
+        for curve in (state.returns, state.true_returns)
+    )
+    return returns, true_returns

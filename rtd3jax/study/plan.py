@@ -1,0 +1,171 @@
+"""What a sweep will do: its cells, and what they will cost, before anything is compiled."""
+
+import dataclasses
+import itertools
+import time
+import warnings
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from rtd3jax.agents.variants import VARIANTS
+from rtd3jax.config import Config
+from rtd3jax.envs.registry import make, parse_disturbance
+from rtd3jax.errors import UserError
+from rtd3jax.training.lanes import Job
+from rtd3jax.training.run import make_jobs
+
+
+@dataclasses.dataclass(frozen=True)
+class Grid:
+    """The product of these: environment × disturbances × algorithms × history lengths."""
+
+    env: str
+    disturbances: tuple[str, ...]
+    algorithms: tuple[str, ...]
+    history_lengths: tuple[int, ...] = (10,)
+    settings: tuple[tuple[str, Any], ...] = ()
+    """Fields of the configuration that differ from the defaults."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+    """One configuration under one disturbance; its seeds are its lanes."""
+
+    env: str
+    disturbance: str
+    config: Config
+
+    @property
+    def key(self) -> dict[str, Any]:
+        """The columns by which the tables know it."""
+        return {
+            "env": self.env,
+            "disturbance": self.disturbance,
+            "algorithm": self.config.algorithm,
+            "history_length": self.config.history_length,
+        }
+
+    def make_env(self) -> Any:
+        """The cell's environment."""
+        disturbance, parameters = parse_disturbance(self.disturbance)
+        return make(self.env, disturbance, **parameters)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in config.json."""
+        return {"env": self.env, "disturbance": self.disturbance, **self.config.to_dict()}
+
+
+ALL_AGENTS = tuple(VARIANTS)
+LENGTHS = (1, 3, 6, 10, 20)
+
+_ROVER = Grid("rover", ("ar1-slip", "sine-slip", "none"), ALL_AGENTS)
+_PENDULUM = (
+    Grid("pendulum", ("temporal-sine", "random-sine", "noise", "hidden"), ALL_AGENTS, LENGTHS),
+    Grid("pendulum", ("none", "temporal-bias"), ("lstm-td3", "lstm-td3-no-action"), LENGTHS),
+)
+PRESETS: dict[str, tuple[Grid, ...]] = {
+    "quick": (
+        Grid(
+            "rover",
+            ("ar1-slip",),
+            ("td3", "h-td3", "lstm-td3-1ha1hc"),
+            (2,),
+            (("total_steps", 8_000), ("hidden_size", 64), ("eval_every", 500)),
+        ),
+    ),
+    "rover": (_ROVER,),
+    "pendulum": _PENDULUM,
+    "paper": (_ROVER, *_PENDULUM),
+}
+"""quick: minutes on two cores; rover: the paper's rover table; pendulum: its benchmark figures."""
+
+
+def make_cells(grids: Iterable[Grid], overrides: dict[str, Any]) -> list[Cell]:
+    """The distinct cells of ``grids``, in order; ``overrides`` are fields of every configuration."""
+    cells: dict[Cell, None] = {}
+    for grid in grids:
+        combinations = itertools.product(grid.disturbances, grid.algorithms, grid.history_lengths)
+        for disturbance, algorithm, length in combinations:
+            with warnings.catch_warnings():
+                # A list of lengths is for the agents that have windows; td3 runs once.
+                warnings.simplefilter("ignore")
+                settings = {**dict(grid.settings), **overrides}
+                config = Config(algorithm=algorithm, history_length=length, **settings)
+            cells[Cell(grid.env, disturbance, config)] = None
+    if not cells:
+        raise UserError("the sweep has no cells: give at least one of every list")
+    return list(cells)
+
+
+def cell_jobs(cell: Cell, seeds: Sequence[int]) -> list[Job]:
+    """A job per seed, owned by ``(cell, seed)``."""
+    return make_jobs(cell.make_env(), cell.config, seeds, cell=cell)
+
+
+@dataclasses.dataclass(frozen=True)
+class Cost:
+    """What a sweep is expected to take.
+
+    Attributes:
+        programs: to compile.
+        lane_bytes: of the largest lane's state.
+        seconds: of computing, without compiling; a rough figure from operation counts.
+    """
+
+    programs: int
+    lane_bytes: int
+    seconds: float
+
+
+def estimate(jobs: Sequence[Job], devices: int) -> Cost:
+    """Count programs, measure lane states from their shapes, and time from operation counts."""
+    programs = dict.fromkeys(job.program for job in jobs)
+    sizes = {}
+    for job in jobs:
+        if job.program not in sizes:
+            shapes = jax.eval_shape(job.program.init, job.lane)
+            sizes[job.program] = sum(
+                leaf.size * getattr(leaf.dtype, "itemsize", 8) for leaf in jax.tree.leaves(shapes)
+            )
+    rate = _matmul_rate()
+    operations = sum(
+        update_flops(job.program.config) * job.program.config.total_steps for job in jobs
+    )
+    steps = sum(job.program.config.total_steps for job in jobs)
+    # Half the rate of a large product, and 0.2 ms for what is not products, were seen on CPUs.
+    seconds = (operations / (0.5 * rate) + 2e-4 * steps) / devices
+    return Cost(len(programs), max(sizes.values()), seconds)
+
+
+def update_flops(config: Config) -> float:
+    """Operations of the products of one environment step's updates (forward = 1, backward = 2).
+
+    Counts what grows with H squared; the narrow encoders are left out.
+    """
+    variant, batch, width = VARIANTS[config.algorithm], config.batch_size, config.hidden_size
+    token = 2.0 * batch * 2 * width * 4 * width
+    layer = 2.0 * batch * width * width
+
+    def forward(spec: Any, past: bool = True) -> float:
+        tokens = int(spec.memory_has_current)
+        if spec.memory and past and not spec.carry_from_replay:
+            tokens += config.history_length or 0
+        return tokens * token + layer * (1 + bool(spec.memory and spec.current))
+
+    actor, critic = forward(variant.actor), forward(variant.critic)
+    delayed = 3 * actor + critic + 2 * forward(variant.critic, past=False)
+    return actor + 2 * critic + 6 * critic + delayed / config.policy_delay
+
+
+def _matmul_rate() -> float:
+    """Operations per second of a large float32 product on one core."""
+    size = 768
+    a = np.ones((size, size), np.float32)
+    began = time.perf_counter()
+    for _ in range(4):
+        a @ a
+    threads = len(jax.local_devices())
+    return 4 * 2.0 * size**3 / (time.perf_counter() - began) / threads

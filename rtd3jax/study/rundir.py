@@ -1,0 +1,265 @@
+"""A run directory: its configuration, a file per finished lane, and what is derived from them.
+
+``lanes/<cell>/seed-<n>.safetensors`` holds a lane's trained actor, its learning curve and its
+final episodes. Tables, pictures and the summary are made from those files alone, so that they are
+the same whatever the order in which lanes ended, and can be made again at any time.
+"""
+
+import dataclasses
+import importlib.metadata
+import json
+import platform
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save
+
+from rtd3jax.errors import UserError
+from rtd3jax.study.figures import final_returns, learning_curves
+from rtd3jax.study.plan import Cell
+from rtd3jax.study.results import (
+    CURVES,
+    EPISODES,
+    REFERENCES,
+    read_table,
+    write_bytes_atomically,
+    write_table,
+)
+from rtd3jax.study.summary import summary_markdown
+
+_PACKAGES = ("rtd3jax", "jax", "jaxlib", "flax", "optax", "gymnax", "numpy")
+
+
+@dataclasses.dataclass(frozen=True)
+class Reference:
+    """Returns of a policy that needs no training: [episodes] each."""
+
+    env: str
+    disturbance: str
+    name: str
+    returns: np.ndarray
+    true_returns: np.ndarray
+
+
+class RunDirectory:
+    """The directory of one sweep.
+
+    Raises:
+        UserError: when it holds another study, or cannot be written.
+    """
+
+    def __init__(
+        self, path: str | Path, cells: Sequence[Cell], seeds: Sequence[int], episodes: int
+    ):
+        self.path = Path(path)
+        self.cells = list(cells)
+        self.seeds = list(seeds)
+        self._study = {
+            "cells": [cell.to_dict() for cell in cells],
+            "seeds": list(seeds),
+            "final_episodes": episodes,
+        }
+        self._open()
+
+    def _open(self) -> None:
+        config = self.path / "config.json"
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            if config.exists():
+                self._check_same(config)
+                return
+            if any(self.path.iterdir()):
+                raise UserError(
+                    f"--out {self.path} is not empty and holds no study; choose another directory"
+                )
+            content = {"study": self._study, "made_with": _made_with()}
+            write_bytes_atomically(config, (json.dumps(content, indent=1) + "\n").encode())
+        except OSError as error:
+            raise UserError(f"--out {self.path} cannot be written: {error.strerror}") from error
+
+    def _check_same(self, config: Path) -> None:
+        try:
+            study = json.loads(config.read_text())["study"]
+        except (ValueError, KeyError, TypeError) as error:
+            raise UserError(f"{config} is not a study's configuration ({error})") from error
+        if study != json.loads(json.dumps(self._study)):
+            raise UserError(
+                f"--out {self.path} holds another study ({_difference(study, self._study)}); "
+                "choose another directory, or remove that one"
+            )
+
+    def lane_path(self, cell: Cell, seed: int) -> Path:
+        """Where a lane's file is."""
+        return self.path / "lanes" / cell_name(cell) / f"seed-{seed}.safetensors"
+
+    def is_done(self, cell: Cell, seed: int) -> bool:
+        """Whether the lane was trained to its end."""
+        return self.lane_path(cell, seed).exists()
+
+    def write_lane(
+        self,
+        cell: Cell,
+        seed: int,
+        actor: Any,
+        curves: dict[str, np.ndarray],
+        failure: dict[str, Any] | None,
+    ) -> None:
+        """Keep a lane that ended.
+
+        Args:
+            cell: its cell.
+            seed: its seed.
+            actor: parameters of the actor, a nested dict.
+            curves: ``steps``, ``returns``, ``true_returns`` [K] and ``final_returns``,
+                ``final_true_returns`` [episodes].
+            failure: step and reason, if the lane was lost.
+        """
+        arrays = {f"actor.{name}": value for name, value in flatten(actor).items()}
+        arrays |= {f"results.{name}": np.asarray(value) for name, value in curves.items()}
+        metadata = {
+            "cell": json.dumps(cell.to_dict()),
+            "seed": str(seed),
+            "failure": json.dumps(failure),
+        }
+        path = self.lane_path(cell, seed)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes_atomically(path, save(arrays, metadata))
+
+    def derive(self, references: Iterable[Reference], *, pictures: bool = True) -> None:
+        """Write tables, pictures and the summary of the lanes there are."""
+        curves: list[dict[str, Any]] = []
+        episodes: list[dict[str, Any]] = []
+        failures: list[dict[str, Any]] = []
+        for cell in self.cells:
+            for seed in self.seeds:
+                if self.is_done(cell, seed):
+                    self._read_lane(cell, seed, curves, episodes, failures)
+        for reference in references:
+            episodes += _reference_rows(reference)
+        write_table(self.path / "curves.parquet", curves, CURVES)
+        write_table(self.path / "episodes.parquet", episodes, EPISODES)
+        curve_table = read_table(self.path / "curves.parquet", CURVES)
+        episode_table = read_table(self.path / "episodes.parquet", EPISODES)
+        text = summary_markdown(self._excerpt(), curve_table, episode_table, failures)
+        write_bytes_atomically(self.path / "summary.md", text.encode())
+        if pictures:
+            learning_curves(curve_table, episode_table, self.path)
+            final_returns(episode_table, self.path)
+
+    def _read_lane(self, cell: Cell, seed: int, curves: list, episodes: list, failures: list):
+        path = self.lane_path(cell, seed)
+        try:
+            arrays = load_file(path)
+            metadata = _metadata(path)
+            failure = json.loads(metadata["failure"])
+            row = {**cell.key, "seed": seed}
+            for step, value, true in zip(
+                arrays["results.steps"],
+                arrays["results.returns"],
+                arrays["results.true_returns"],
+                strict=True,
+            ):
+                curves.append({**row, "step": int(step), "return": value, "true_return": true})
+            pairs = zip(
+                arrays["results.final_returns"], arrays["results.final_true_returns"], strict=True
+            )
+            for episode, (value, true) in enumerate(pairs):
+                episodes.append({**row, "episode": episode, "return": value, "true_return": true})
+        except (OSError, SafetensorError, KeyError, ValueError, TypeError) as error:
+            raise UserError(
+                f"{path} cannot be read ({error}); remove it, and the same command trains it again"
+            ) from error
+        if failure is not None:
+            failures.append({**row, **failure})
+
+    def _excerpt(self) -> dict[str, object]:
+        """What all cells have in common, for the summary."""
+        dicts = [cell.to_dict() for cell in self.cells]
+        common = {
+            name: value
+            for name, value in dicts[0].items()
+            if all(other[name] == value for other in dicts)
+        }
+        return {
+            "cells": len(self.cells),
+            "seeds": len(self.seeds),
+            "final episodes per seed": self._study["final_episodes"],
+            **common,
+        }
+
+
+def cell_name(cell: Cell) -> str:
+    """A directory name that tells cells apart."""
+    text = f"{cell.env}_{cell.disturbance}_{cell.config.algorithm}_l{cell.config.history_length}"
+    return re.sub(r"[^A-Za-z0-9._=+-]", "-", text)
+
+
+def flatten(tree: Any, prefix: str = "") -> dict[str, np.ndarray]:
+    """A nested dict's arrays under dotted names."""
+    if not isinstance(tree, dict):
+        return {prefix: np.asarray(tree)}
+    flat = {}
+    for name, value in tree.items():
+        flat |= flatten(value, f"{prefix}.{name}" if prefix else name)
+    return flat
+
+
+def _metadata(path: Path) -> dict[str, str]:
+    from safetensors import safe_open
+
+    with safe_open(path, "numpy") as file:
+        return file.metadata()
+
+
+def _reference_rows(reference: Reference) -> list[dict[str, Any]]:
+    assert reference.name in REFERENCES
+    key = {
+        "env": reference.env,
+        "disturbance": reference.disturbance,
+        "algorithm": reference.name,
+        "history_length": 0,
+        "seed": -1,
+    }
+    pairs = zip(reference.returns, reference.true_returns, strict=True)
+    return [
+        {**key, "episode": episode, "return": value, "true_return": true}
+        for episode, (value, true) in enumerate(pairs)
+    ]
+
+
+def _made_with() -> dict[str, Any]:
+    versions = {}
+    for package in _PACKAGES:
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            versions[package] = "unknown"
+    device = jax.local_devices()[0]
+    return {
+        "python": platform.python_version(),
+        "versions": versions,
+        "backend": jax.default_backend(),
+        "device": device.device_kind,
+        "devices": len(jax.local_devices()),
+        "machine": platform.machine(),
+    }
+
+
+def _difference(old: Any, new: Any) -> str:
+    """The first thing in which two studies differ, in words."""
+    for name in ("seeds", "final_episodes"):
+        if old.get(name) != new[name]:
+            return f"{name}: {old.get(name)} there, {new[name]} here"
+    before, after = old.get("cells", []), json.loads(json.dumps(new["cells"]))
+    if len(before) != len(after):
+        return f"{len(before)} cells there, {len(after)} here"
+    for one, other in zip(before, after, strict=True):
+        for name in other:
+            if one.get(name) != other[name]:
+                return f"{name}: {one.get(name)} there, {other[name]} here"
+    return "another format"
