@@ -24,7 +24,7 @@ from rtd3jax.evaluate import evaluate
 from rtd3jax.policy import constant_policy, random_policy
 from rtd3jax.study.plan import PRESETS, Cell, Grid, cell_jobs, estimate, make_cells
 from rtd3jax.study.rundir import Reference, RunDirectory
-from rtd3jax.training.lanes import Group, Job, advance_groups, make_groups, use_all_cores
+from rtd3jax.training.lanes import Group, Job, advance_groups, make_groups, workers
 from rtd3jax.training.progress import Progress
 from rtd3jax.training.run import check_strategy, curves_of, evaluation_steps, failure_of
 
@@ -38,7 +38,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if options.device:
             jax.config.update("jax_platforms", {"gpu": "cuda"}.get(options.device, options.device))
-        use_all_cores()
         _check_backend(options.device)
         return _run(options)
     except UserError as error:
@@ -60,7 +59,7 @@ def _run(options: argparse.Namespace) -> int:
     if len(waiting) < len(jobs):
         print(f"{len(jobs) - len(waiting)} of {len(jobs)} lanes are there already")
     lost = interrupted = False
-    groups = make_groups(waiting, strategy, len(jax.local_devices()))
+    groups = make_groups(waiting, strategy, len(workers()))
     recorder = _Recorder(directory, episodes)
     references = [r for cell in _worlds(cells) for r in _references(cell)]
     try:
@@ -102,7 +101,8 @@ class _Recorder:
             self.complaints.append(f"{_label(group.jobs[0])} seed {seed} failed: {reason}")
             return
         self._log(group)
-        if group.finished:
+        # An event may be read late, after the one that already kept the group.
+        if group.finished and group.state is not None:
             for job, state in group.lanes():
                 self._keep(job, state)
             group.state = None  # its replay is no longer needed
@@ -186,8 +186,8 @@ def _label(job: Job) -> str:
 
 
 def _plan_text(cells: Sequence[Cell], seeds: Sequence[int], jobs: Sequence[Job]) -> str:
-    devices = len(jax.local_devices())
-    cost = estimate(jobs, devices)
+    count = len(workers())
+    cost = estimate(jobs, count)
     lines = [f"{len(cells)} cells × {len(seeds)} seeds = {len(jobs)} lanes"]
     for cell in cells:
         config = cell.config
@@ -199,7 +199,8 @@ def _plan_text(cells: Sequence[Cell], seeds: Sequence[int], jobs: Sequence[Job])
         f"programs to compile: {cost.programs}",
         f"memory: {cost.lane_bytes / 2**20:,.0f} MiB for the state of the largest lane; "
         f"{len(seeds)} lanes of a cell are held at once",
-        f"time: about {_duration(cost.seconds)} on {devices} {jax.default_backend()} device(s), "
+        f"time: about {_duration(cost.seconds)} on {count} "
+        f"{'cores' if jax.default_backend() == 'cpu' else 'devices'}, "
         "by a count of operations, without compiling",
     ]
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""Strictness for every test, and one device per core, before any backend starts."""
+"""Strictness for every test, and a cache of compiled programs."""
 
 import pathlib
 
@@ -8,7 +8,6 @@ import matplotlib
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
-jax.config.update("jax_num_cpu_devices", 2)
 cache = pathlib.Path(__file__).parent.parent / ".pytest_cache" / "jax"
 jax.config.update("jax_compilation_cache_dir", str(cache))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

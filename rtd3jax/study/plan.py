@@ -84,7 +84,7 @@ PRESETS: dict[str, tuple[Grid, ...]] = {
 
 
 def make_cells(grids: Iterable[Grid], overrides: dict[str, Any]) -> list[Cell]:
-    """The distinct cells of ``grids``, in order; ``overrides`` are fields of every configuration."""
+    """The distinct cells of ``grids``, in order; ``overrides`` are fields of all configurations."""
     cells: dict[Cell, None] = {}
     for grid in grids:
         combinations = itertools.product(grid.disturbances, grid.algorithms, grid.history_lengths)
@@ -120,7 +120,7 @@ class Cost:
     seconds: float
 
 
-def estimate(jobs: Sequence[Job], devices: int) -> Cost:
+def estimate(jobs: Sequence[Job], workers: int) -> Cost:
     """Count programs, measure lane states from their shapes, and time from operation counts."""
     programs = dict.fromkeys(job.program for job in jobs)
     sizes = {}
@@ -130,13 +130,13 @@ def estimate(jobs: Sequence[Job], devices: int) -> Cost:
             sizes[job.program] = sum(
                 leaf.size * getattr(leaf.dtype, "itemsize", 8) for leaf in jax.tree.leaves(shapes)
             )
-    rate = _matmul_rate()
+    rate = _matmul_rate(workers)
     operations = sum(
         update_flops(job.program.config) * job.program.config.total_steps for job in jobs
     )
     steps = sum(job.program.config.total_steps for job in jobs)
     # Half the rate of a large product, and 0.2 ms for what is not products, were seen on CPUs.
-    seconds = (operations / (0.5 * rate) + 2e-4 * steps) / devices
+    seconds = (operations / (0.5 * rate) + 2e-4 * steps) / workers
     return Cost(len(programs), max(sizes.values()), seconds)
 
 
@@ -160,12 +160,11 @@ def update_flops(config: Config) -> float:
     return actor + 2 * critic + 6 * critic + delayed / config.policy_delay
 
 
-def _matmul_rate() -> float:
-    """Operations per second of a large float32 product on one core."""
+def _matmul_rate(threads: int) -> float:
+    """Operations per second and core of a large float32 product."""
     size = 768
     a = np.ones((size, size), np.float32)
     began = time.perf_counter()
     for _ in range(4):
         a @ a
-    threads = len(jax.local_devices())
     return 4 * 2.0 * size**3 / (time.perf_counter() - began) / threads

@@ -203,7 +203,7 @@ def flatten(tree: Any, prefix: str = "") -> dict[str, np.ndarray]:
     """A nested dict's arrays under dotted names."""
     if not isinstance(tree, dict):
         return {prefix: np.asarray(tree)}
-    flat = {}
+    flat: dict[str, np.ndarray] = {}
     for name, value in tree.items():
         flat |= flatten(value, f"{prefix}.{name}" if prefix else name)
     return flat

@@ -1,4 +1,4 @@
-"""Lanes over devices: which device runs which group of lanes, and for how many steps.
+"""Lanes over cores and devices: who runs which group of lanes, and for how many steps.
 
 A *group* is what one call of a compiled program advances: on a CPU a single lane, so that a lane's
 numbers cannot depend on its company and no product is split over threads; on an accelerator as
@@ -6,7 +6,6 @@ many lanes as there are, under ``vmap``, because there width is nearly free. Eac
 worker that takes the group that lags most, so that five lanes keep two cores equally busy.
 """
 
-import contextlib
 import dataclasses
 import os
 import threading
@@ -86,14 +85,16 @@ def default_strategy() -> str:
     return "map" if jax.default_backend() == "cpu" else "vmap"
 
 
-def use_all_cores() -> None:
-    """One CPU device per core, if JAX has not started yet and nobody has chosen otherwise."""
-    if jax.config.jax_num_cpu_devices > 0 or "host_platform_device_count" in os.environ.get(
-        "XLA_FLAGS", ""
-    ):
-        return
-    with contextlib.suppress(RuntimeError):  # raised where the backend has started
-        jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
+def workers() -> list[Any]:
+    """The device of each worker: one worker per accelerator, or one per CPU core.
+
+    On a CPU all workers share JAX's one device. Their programs are compiled to run on the calling
+    thread alone, so that the cores are shared out by lanes and not within a product; a second
+    device would only compile everything a second time.
+    """
+    if jax.default_backend() == "cpu":
+        return jax.local_devices()[:1] * len(os.sched_getaffinity(0))
+    return jax.local_devices()
 
 
 def make_groups(jobs: Sequence[Job], strategy: str, devices: int) -> list[Group]:
@@ -113,28 +114,26 @@ def make_groups(jobs: Sequence[Job], strategy: str, devices: int) -> list[Group]
 def advance_groups(
     groups: Sequence[Group],
     on_chunk: Callable[[Group], None],
-    devices: Sequence[Any] | None = None,
 ) -> None:
     """Advance every group to its end, calling ``on_chunk`` in this thread after each chunk.
 
     A group that raises keeps its error and does not touch the others. An interrupt stops the
     workers after their current chunks and is raised again.
     """
-    devices = list(devices or jax.local_devices())
     pool = _Pool(groups)
-    workers = [
+    threads = [
         threading.Thread(target=_work, args=(pool, device), daemon=True)
-        for device in devices[: max(1, len(groups))]
+        for device in workers()[: max(1, len(groups))]
     ]
-    for worker in workers:
-        worker.start()
+    for thread in threads:
+        thread.start()
     try:
         for group in pool.events():
             on_chunk(group)
     finally:
         pool.stop()
-        for worker in workers:
-            worker.join()
+        for thread in threads:
+            thread.join()
 
 
 class _Pool:
@@ -205,7 +204,7 @@ def _chunk(group: Group, device: Any, rates: dict[Any, float]) -> None:
     lanes = [job.lane for job in group.jobs]
     lane = lanes[0] if width == 1 else jax.tree.map(lambda *leaves: jnp.stack(leaves), *lanes)
     lane = jax.device_put(lane, device)
-    init, advance = _compiled(program, width > 1)
+    init, advance = _compiled(program, lane, width > 1, device)
     state = init(lane) if group.state is None else jax.device_put(group.state, device)
     rate = rates.get((program, width))
     steps = _FIRST_CHUNK if rate is None else max(1, int(rate * CHUNK_SECONDS))
@@ -225,23 +224,44 @@ def _chunk(group: Group, device: Any, rates: dict[Any, float]) -> None:
     group.state, group.step = state, stop
 
 
-_programs: dict[Any, tuple[Any, Any]] = {}
+class _Compiled:
+    """The executables of one program, compiled by whoever needs them first."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self.executables: tuple[Any, Any] | None = None
+
+
+_programs: dict[Any, _Compiled] = {}
 _programs_lock = threading.Lock()
 
 
-def _compiled(program: Program, batched: bool) -> tuple[Any, Any]:
-    """``init`` and ``advance`` under jit, the same objects for equal programs."""
+def _compiled(program: Program, lane: Lane, batched: bool, device: Any) -> tuple[Any, Any]:
+    """``init`` and ``advance``, compiled once for equal programs."""
     with _programs_lock:
-        if (program, batched) not in _programs:
-            init, advance = program.init, program.advance
-            if batched:
-                init = jax.vmap(init)
-                advance = jax.vmap(advance, in_axes=(0, 0, None, None))
-            _programs[program, batched] = (
-                jax.jit(init),
-                jax.jit(advance, donate_argnums=1),
-            )
-        return _programs[program, batched]
+        key = (program, _structure(lane), batched, device)
+        entry = _programs.setdefault(key, _Compiled())
+    with entry.lock:
+        if entry.executables is None:
+            entry.executables = _compile(program, lane, batched)
+        return entry.executables
+
+
+def _compile(program: Program, lane: Lane, batched: bool) -> tuple[Any, Any]:
+    init, advance = program.init, program.advance
+    options = {}
+    if batched:
+        init = jax.vmap(init)
+        advance = jax.vmap(advance, in_axes=(0, 0, None, None))
+    elif jax.default_backend() == "cpu":
+        options = {"xla_cpu_multi_thread_eigen": False}
+    state = jax.eval_shape(init, lane)
+    step = jax.ShapeDtypeStruct((), jnp.int32)
+    jitted = jax.jit(advance, donate_argnums=1, compiler_options=options)
+    return (
+        jax.jit(init, compiler_options=options).lower(lane).compile(),
+        jitted.lower(lane, state, step, step).compile(),
+    )
 
 
 def _structure(lane: Lane) -> Any:

@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-import jax
 import numpy as np
 
 from rtd3jax.config import Config
@@ -17,7 +16,7 @@ from rtd3jax.training.lanes import (
     advance_groups,
     default_strategy,
     make_groups,
-    use_all_cores,
+    workers,
 )
 from rtd3jax.training.loop import (
     ENVIRONMENT_NOT_FINITE,
@@ -105,9 +104,8 @@ def train(
         UserError: for an unfit environment or impossible arguments, before anything is compiled.
     """
     seeds = check_seeds(seeds)
-    use_all_cores()
     jobs = make_jobs(env, config, seeds, params=params)
-    groups = make_groups(jobs, check_strategy(strategy), len(jax.local_devices()))
+    groups = make_groups(jobs, check_strategy(strategy), len(workers()))
     label = f"{config.algorithm} l={config.history_length}"
     with Progress(groups, lambda job: label, enabled=progress) as bar:
         advance_groups(groups, bar.update)
