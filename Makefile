@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: help venv lint format test clean
+.PHONY: help venv sweep lint format test clean
 
 help:  ## these lines
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/:/'
@@ -13,6 +13,9 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	touch $@
 
 venv: $(VENV)/.installed  ## the environment, at the tested versions
+
+sweep: venv  ## train td3, h-td3 and lstm-td3-1ha1hc on the slipping rover: the quick preset
+	$(BIN)/python -m rtd3jax.sweep --preset quick $(ARGS)
 
 lint: venv  ## formatting, lint, types
 	$(BIN)/ruff format --check .

@@ -28,7 +28,7 @@ from rtd3jax.training.lanes import Group, Job, advance_groups, make_groups, work
 from rtd3jax.training.progress import Progress
 from rtd3jax.training.run import check_strategy, curves_of, evaluation_steps, failure_of
 
-REFERENCE_EPISODES = 100
+REFERENCE_EPISODES = 1_000
 _GRID_FIELDS = ("algorithm", "history_length")
 
 

@@ -39,7 +39,7 @@ WINDOWLESS = "td3"
 MARKERS = "osD^vPX"
 
 # Share of the lower edges of the bands that may fall below a learning-curve panel.
-CLIPPED_SHARE = 0.05
+CLIPPED_SHARE = 0.25
 
 _STYLE: Any = {
     "svg.hashsalt": "rtd3jax",  # otherwise element ids are random
@@ -65,7 +65,7 @@ def learning_curves(
     a line is the mean over the seeds with a finite value at that step, its band one standard
     deviation (ddof 1) either side.
 
-    The panels of a row share their y-limits: from the 5th percentile of all lower band edges
+    The panels of a row share their y-limits: from the lower quartile of all lower band edges
     (or the lowest final mean, if lower, so that no line ends outside) to the highest upper edge.
     Very bad returns early in training thus leave the panel instead of squashing the rest.
     """
