@@ -50,7 +50,7 @@ def _run(options: argparse.Namespace) -> int:
     seeds = list(range(_positive("seeds", options.seeds)))
     episodes = _positive("final_episodes", options.final_episodes)
     strategy = check_strategy(options.strategy)
-    jobs = [job for cell in cells for job in cell_jobs(cell, seeds)]
+    jobs = cell_jobs(cells, seeds, strategy)
     if options.dry_run:
         print(_plan_text(cells, seeds, jobs))
         return 0

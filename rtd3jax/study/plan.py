@@ -100,9 +100,19 @@ def make_cells(grids: Iterable[Grid], overrides: dict[str, Any]) -> list[Cell]:
     return list(cells)
 
 
-def cell_jobs(cell: Cell, seeds: Sequence[int]) -> list[Job]:
-    """A job per seed, owned by ``(cell, seed)``."""
-    return make_jobs(cell.make_env(), cell.config, seeds, cell=cell)
+def cell_jobs(cells: Sequence[Cell], seeds: Sequence[int], strategy: str) -> list[Job]:
+    """A job per cell and seed, owned by ``(cell, seed)``.
+
+    Side by side (``vmap``), all history lengths share the longest one's program: there a wider
+    product is nearly free. One by one (``map``), each length has a program of its own.
+    """
+    longest = max(cell.config.history_length or 0 for cell in cells)
+    window = longest if strategy == "vmap" and longest else None
+    return [
+        job
+        for cell in cells
+        for job in make_jobs(cell.make_env(), cell.config, seeds, cell=cell, window=window)
+    ]
 
 
 @dataclasses.dataclass(frozen=True)

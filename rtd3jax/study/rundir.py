@@ -121,11 +121,9 @@ class RunDirectory:
         """
         arrays = {f"actor.{name}": value for name, value in flatten(actor).items()}
         arrays |= {f"results.{name}": np.asarray(value) for name, value in curves.items()}
-        metadata = {
-            "cell": json.dumps(cell.to_dict()),
-            "seed": str(seed),
-            "failure": json.dumps(failure),
-        }
+        # One entry, because several would be written in no fixed order.
+        lane = {"cell": cell.to_dict(), "seed": seed, "failure": failure}
+        metadata = {"rtd3jax": json.dumps(lane)}
         path = self.lane_path(cell, seed)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_bytes_atomically(path, save(arrays, metadata))
@@ -156,7 +154,7 @@ class RunDirectory:
         try:
             arrays = load_file(path)
             metadata = _metadata(path)
-            failure = json.loads(metadata["failure"])
+            failure = json.loads(metadata["rtd3jax"])["failure"]
             row = {**cell.key, "seed": seed}
             for step, value, true in zip(
                 arrays["results.steps"],

@@ -312,10 +312,22 @@ class Program:
         return dataclasses.replace(state, returns=returns, true_returns=true_returns)
 
 
-def make_program(env: Any, config: Config, observation_size: int, action_shape: tuple) -> Program:
-    """The program of lanes that differ in nothing but traced numbers."""
+def make_program(
+    env: Any,
+    config: Config,
+    observation_size: int,
+    action_shape: tuple[int, ...],
+    window: int | None = None,
+) -> Program:
+    """The program of lanes that differ in nothing but traced numbers.
+
+    With ``window``, lanes may differ in their history length too, up to that: the window's arrays
+    are as long, and what is beyond a lane's own length does not exist for it.
+    """
     defaults = {name: getattr(Config, name) for name in traced_fields()}
     static = dataclasses.replace(config, **defaults)
+    if window is not None and config.algorithm != "td3":
+        static = dataclasses.replace(static, history_length=window)
     return Program(env, static, observation_size, action_shape)
 
 

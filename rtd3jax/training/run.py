@@ -113,12 +113,21 @@ def train(
 
 
 def make_jobs(
-    env: Any, config: Config, seeds: Sequence[int], *, params: Any = None, cell: Any = None
+    env: Any,
+    config: Config,
+    seeds: Sequence[int],
+    *,
+    params: Any = None,
+    cell: Any = None,
+    window: int | None = None,
 ) -> list[Job]:
-    """A job per seed, owned by ``(cell, seed)``; checks the environment."""
+    """A job per seed, owned by ``(cell, seed)``; checks the environment.
+
+    With ``window``, jobs of shorter history lengths share the program of that length.
+    """
     params = env.default_params if params is None else params
     interface = describe(env, params)
-    program = make_program(env, config, interface.observation_size, interface.action_shape)
+    program = make_program(env, config, interface.observation_size, interface.action_shape, window)
     return [Job(program, make_lane(config, seed, params), (cell, seed)) for seed in seeds]
 
 

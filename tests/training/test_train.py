@@ -90,3 +90,28 @@ def test_gymnax_environments_train_without_glue(env_id):
 def test_bad_seeds_are_refused(seeds):
     with pytest.raises(rtd.UserError, match="seeds must be"):
         rtd.train(_rover(), TINY, seeds, progress=False)
+
+
+def test_lengths_side_by_side_equal_exact_windows():
+    """One program, two lanes of different history length; each equals its own exact program."""
+    from rtd3jax.study.plan import Cell, cell_jobs
+    from rtd3jax.training.lanes import advance_groups, make_groups
+    from rtd3jax.training.run import collect
+
+    configs = [
+        dataclasses.replace(TINY, algorithm="h-td3", history_length=length, total_steps=60)
+        for length in (1, 3)
+    ]
+    cells = [Cell("rover", "ar1-slip", config) for config in configs]
+    groups = make_groups(cell_jobs(cells, [0], "vmap"), "vmap", 1)
+    assert len(groups) == 1
+    advance_groups(groups, lambda group: None)
+    for (_, state), config in zip(groups[0].lanes(), configs, strict=True):
+        exact = make_groups(cell_jobs([Cell("rover", "ar1-slip", config)], [0], "map"), "map", 1)
+        advance_groups(exact, lambda group: None)
+        run = collect(config, [0], exact)
+        np.testing.assert_allclose(state.returns, run.returns[0], rtol=1e-4)
+        for a, b in zip(
+            jax.tree.leaves(state.learner.actor), jax.tree.leaves(run.policy(0).actor), strict=True
+        ):
+            np.testing.assert_allclose(a, b, atol=1e-4)

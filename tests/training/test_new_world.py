@@ -1,0 +1,53 @@
+"""A world that the library does not know, with real terminations, trains as it is."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from gymnax.environments import environment, spaces
+
+import rtd3jax as rtd
+
+
+@struct.dataclass
+class State:
+    time: jax.Array
+    position: jax.Array
+
+
+class Cart(environment.Environment):
+    """Push a point to the origin; beyond 1 m the episode terminates."""
+
+    @property
+    def default_params(self):
+        return environment.EnvParams(max_steps_in_episode=20)
+
+    def reset_env(self, key, params):
+        position = jax.random.uniform(key, (), jnp.float32, -0.5, 0.5)
+        return position[None], State(jnp.int32(0), position)
+
+    def step_env(self, key, state, action, params):
+        position = state.position + 0.2 * jnp.clip(action[0], -1.0, 1.0)
+        state = State(state.time + jnp.int32(1), position)
+        terminated = jnp.abs(position) > 1.0
+        reward = -(position**2) - 5.0 * terminated
+        return position[None], state, reward, terminated, {}
+
+    def action_space(self, params):
+        return spaces.Box(-1.0, 1.0, (1,))
+
+
+def test_a_new_world_trains_and_its_terminations_count():
+    env = Cart()
+    config = rtd.Config(
+        algorithm="lstm-td3-1ha2hc",
+        history_length=2,
+        total_steps=3_000,
+        hidden_size=16,
+        batch_size=32,
+        learning_starts=200,
+        eval_every=1_500,
+    )
+    run = rtd.train(env, config, [0], progress=False)
+    random = rtd.evaluate(rtd.random_policy(env), env, episodes=50)
+    assert run.returns[0, -1] > -2.0 > float(np.mean(random))
