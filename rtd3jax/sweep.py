@@ -22,7 +22,7 @@ from rtd3jax.envs.registry import DISTURBANCES, ENVIRONMENTS
 from rtd3jax.errors import UserError
 from rtd3jax.evaluate import evaluate
 from rtd3jax.policy import constant_policy, random_policy
-from rtd3jax.study.plan import PRESETS, Cell, Grid, cell_jobs, estimate, make_cells
+from rtd3jax.study.plan import PRESETS, Cell, Grid, cell_jobs, estimate, lane_bytes, make_cells
 from rtd3jax.study.rundir import Reference, RunDirectory
 from rtd3jax.training.lanes import Group, Job, advance_groups, make_groups, workers
 from rtd3jax.training.progress import Progress
@@ -37,8 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         if options.device:
-            jax.config.update("jax_platforms", {"gpu": "cuda"}.get(options.device, options.device))
-        _check_backend(options.device)
+            jax.config.update("jax_default_device", _device(options.device))
         return _run(options)
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -54,6 +53,7 @@ def _run(options: argparse.Namespace) -> int:
     if options.dry_run:
         print(_plan_text(cells, seeds, jobs))
         return 0
+    _check_memory(jobs)
     directory = RunDirectory(_out(options), cells, seeds, episodes)
     waiting = [job for job in jobs if not directory.is_done(*job.owner)]
     if len(waiting) < len(jobs):
@@ -200,7 +200,7 @@ def _plan_text(cells: Sequence[Cell], seeds: Sequence[int], jobs: Sequence[Job])
         f"memory: {cost.lane_bytes / 2**20:,.0f} MiB for the state of the largest lane; "
         f"{len(seeds)} lanes of a cell are held at once",
         f"time: about {_duration(cost.seconds)} on {count} "
-        f"{'cores' if jax.default_backend() == 'cpu' else 'devices'}, "
+        f"{'cores' if workers()[0].platform == 'cpu' else 'devices'}, "
         "by a count of operations, without compiling",
     ]
     return "\n".join(lines)
@@ -247,15 +247,28 @@ def _positive(name: str, value: int) -> int:
     return value
 
 
-def _check_backend(device: str | None) -> None:
+def _device(platform: str) -> Any:
     try:
-        jax.local_devices()
+        return jax.local_devices(backend=platform)[0]
     except RuntimeError as error:
-        wanted = device or os.environ.get("JAX_PLATFORMS", "")
         raise UserError(
-            f"--device {wanted}: there is no such device here, or JAX was installed without it "
+            f"--device {platform}: there is none here, or JAX was installed without it "
             "(pip install 'rtd3jax[cuda13]' for NVIDIA GPUs)"
         ) from error
+
+
+def _check_memory(jobs: Sequence[Job]) -> None:
+    """Refuse lanes of which not even one fits."""
+    needed, there = max(lane_bytes(jobs).values()), _memory()
+    if needed > there:
+        raise UserError(
+            f"one lane needs {needed / 2**30:,.1f} GiB and the machine has {there / 2**30:,.1f}; "
+            "lower replay_capacity or hidden_size"
+        )
+
+
+def _memory() -> int:
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 def _parser() -> argparse.ArgumentParser:

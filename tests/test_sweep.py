@@ -100,6 +100,8 @@ def test_a_lost_lane_is_reported_and_the_exit_status_says_so(tmp_path, capsys):
         ("--preset quick --total-steps -1", "total_steps must be at least 1"),
         ("--preset quick --batch-size 5000", "batch_size"),
         ("--env pendulum --disturbances noise:sigma=-1", "sigma"),
+        ("--preset quick --device gpu", "--device gpu: there is none here"),
+        ("--preset quick --hidden-size 200000", "one lane needs"),
         ("--preset quick --history-lengths 0", "history_length must be at least 1"),
     ],
 )

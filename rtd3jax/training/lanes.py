@@ -82,7 +82,7 @@ class Group:
 
 def default_strategy() -> str:
     """``map`` on CPUs, ``vmap`` on accelerators."""
-    return "map" if jax.default_backend() == "cpu" else "vmap"
+    return "map" if _default_device().platform == "cpu" else "vmap"
 
 
 def workers() -> list[Any]:
@@ -92,9 +92,15 @@ def workers() -> list[Any]:
     thread alone, so that the cores are shared out by lanes and not within a product; a second
     device would only compile everything a second time.
     """
-    if jax.default_backend() == "cpu":
-        return jax.local_devices()[:1] * len(os.sched_getaffinity(0))
-    return jax.local_devices()
+    first = _default_device()
+    if first.platform == "cpu":
+        return [first] * len(os.sched_getaffinity(0))
+    return jax.local_devices(backend=first.platform)
+
+
+def _default_device() -> Any:
+    """The device that JAX uses where none is named; `jax_default_device` chooses another."""
+    return jax.config.values["jax_default_device"] or jax.local_devices()[0]
 
 
 def make_groups(jobs: Sequence[Job], strategy: str, devices: int) -> list[Group]:
@@ -243,17 +249,17 @@ def _compiled(program: Program, lane: Lane, batched: bool, device: Any) -> tuple
         entry = _programs.setdefault(key, _Compiled())
     with entry.lock:
         if entry.executables is None:
-            entry.executables = _compile(program, lane, batched)
+            entry.executables = _compile(program, lane, batched, device)
         return entry.executables
 
 
-def _compile(program: Program, lane: Lane, batched: bool) -> tuple[Any, Any]:
+def _compile(program: Program, lane: Lane, batched: bool, device: Any) -> tuple[Any, Any]:
     init, advance = program.init, program.advance
     options = {}
     if batched:
         init = jax.vmap(init)
         advance = jax.vmap(advance, in_axes=(0, 0, None, None))
-    elif jax.default_backend() == "cpu":
+    elif device.platform == "cpu":
         options = {"xla_cpu_multi_thread_eigen": False}
     state = jax.eval_shape(init, lane)
     step = jax.ShapeDtypeStruct((), jnp.int32)

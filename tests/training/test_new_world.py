@@ -51,3 +51,25 @@ def test_a_new_world_trains_and_its_terminations_count():
     run = rtd.train(env, config, [0], progress=False)
     random = rtd.evaluate(rtd.random_policy(env), env, episodes=50)
     assert run.returns[0, -1] > -2.0 > float(np.mean(random))
+
+
+class Broken(Cart):
+    """Its sensor fails at the fifth step."""
+
+    def step_env(self, key, state, action, params):
+        observation, state, reward, terminated, info = super().step_env(key, state, action, params)
+        return jnp.where(state.time > 5, jnp.nan, observation), state, reward, terminated, info
+
+
+def test_nan_from_an_environment_is_reported_as_its_own():
+    config = rtd.Config(
+        algorithm="td3",
+        total_steps=100,
+        hidden_size=4,
+        batch_size=4,
+        learning_starts=10,
+        eval_every=50,
+    )
+    run = rtd.train(Broken(), config, [0], progress=False)
+    assert "environment gave an observation or reward that is not finite" in run.failures[0].reason
+    assert run.failures[0].step < 10 and np.isnan(run.returns).all()
