@@ -1,0 +1,161 @@
+"""Targets, losses and updates against the formulas written out."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from rtd3jax.agents import td3
+from rtd3jax.agents.networks import apply_network
+from rtd3jax.agents.replay import Batch
+from rtd3jax.agents.variants import VARIANTS
+from rtd3jax.agents.windows import Steps, Window
+
+B, L, WIDTH = 6, 2, 16
+BOUNDS = td3.Bounds(jnp.array([-2.0]), jnp.array([4.0]))
+
+
+def _numbers(**changes):
+    numbers = dict(
+        actor_learning_rate=1e-2,
+        critic_learning_rate=2e-2,
+        gamma=0.9,
+        tau=0.1,
+        exploration_noise=0.1,
+        target_noise=0.2,
+        target_noise_clip=0.3,
+    )
+    values = {name: jnp.float32(value) for name, value in (numbers | changes).items()}
+    return td3.Hyperparameters(**values, history_length=jnp.int32(L))
+
+
+def _window(key):
+    a, b, c, d, e = jax.random.split(key, 5)
+    past = Steps(
+        jax.random.normal(a, (L, B, 3)),
+        jax.random.normal(b, (L, B, 1)),
+        jax.random.normal(c, (L, B, 1)),
+    )
+    length = jnp.array([0, 1, 2, 2, 2, 2], jnp.int32)
+    return Window(past, length, jax.random.normal(d, (B, 3)), jax.random.normal(e, (B, 1)))
+
+
+def _batch():
+    keys = jax.random.split(jax.random.key(5), 4)
+    return Batch(
+        window=_window(keys[0]),
+        action=jax.random.uniform(keys[1], (B, 1), minval=-2.0, maxval=4.0),
+        reward=jnp.arange(B, dtype=jnp.float32),
+        terminated=jnp.array([True, False, False, True, False, False]),
+        next_window=_window(keys[2]),
+        carry=None,
+        next_carry=None,
+    )
+
+
+@pytest.fixture(params=["td3", "lstm-td3-1ha1hc", "lstm-td3"])
+def problem(request):
+    variant = VARIANTS[request.param]
+    learner = td3.init_learner(jax.random.key(0), variant, 3, 1, WIDTH)
+    other = td3.init_learner(jax.random.key(1), variant, 3, 1, WIDTH)
+    learner = learner.replace(
+        target_actor=other.actor, target_critics=other.critics
+    )  # so that targets and online networks cannot be taken for one another
+    return variant, learner, _batch()
+
+
+def test_target_is_the_formula(problem):
+    variant, learner, batch = problem
+    got = td3.target(learner, variant, batch, jax.random.key(9), _numbers(), BOUNDS)
+    noise = np.clip(0.2 * np.asarray(jax.random.normal(jax.random.key(9), (B, 1))), -0.3, 0.3) * 3.0
+    output = apply_network(learner.target_actor, variant.actor, batch.next_window)
+    action = np.clip(1.0 + 3.0 * np.tanh(np.asarray(output)) + noise, -2.0, 4.0)
+    values = [
+        np.asarray(apply_network(critic, variant.critic, batch.next_window, jnp.asarray(action)))
+        for critic in learner.target_critics
+    ]
+    assert not np.allclose(*values)
+    bootstrap = 0.9 * np.minimum(*values)[:, 0] * ~np.asarray(batch.terminated)
+    np.testing.assert_allclose(got, np.asarray(batch.reward) + bootstrap, rtol=1e-5, atol=1e-6)
+
+
+def test_target_noise_is_clipped(problem):
+    variant, learner, batch = problem
+    wide = td3.target(learner, variant, batch, jax.random.key(1), _numbers(target_noise=99), BOUNDS)
+    still = td3.target(
+        learner,
+        variant,
+        batch,
+        jax.random.key(1),
+        _numbers(target_noise=99, target_noise_clip=0),
+        BOUNDS,
+    )
+    none = td3.target(learner, variant, batch, jax.random.key(1), _numbers(target_noise=0), BOUNDS)
+    np.testing.assert_allclose(still, none, rtol=1e-6)
+    assert not np.allclose(wide, none)
+
+
+def test_critic_loss_sums_two_mean_squared_errors(problem):
+    variant, learner, batch = problem
+    y = jnp.linspace(-1.0, 1.0, B)
+    expected = sum(
+        np.mean((apply_network(c, variant.critic, batch.window, batch.action)[:, 0] - y) ** 2)
+        for c in learner.critics
+    )
+    got = td3.critic_loss(learner.critics, variant, batch, y)
+    np.testing.assert_allclose(got, expected, rtol=1e-5)
+
+
+def test_the_actor_climbs_the_first_critic(problem):
+    variant, learner, batch = problem
+
+    def loss(actor):
+        action = 1.0 + 3.0 * jnp.tanh(apply_network(actor, variant.actor, batch.window))
+        return -jnp.mean(apply_network(learner.critics[0], variant.critic, batch.window, action))
+
+    value, gradient = jax.value_and_grad(td3.actor_loss)(
+        learner.actor, learner.critics[0], variant, batch, BOUNDS
+    )
+    expected, expected_gradient = jax.value_and_grad(loss)(learner.actor)
+    np.testing.assert_allclose(value, expected, rtol=1e-5)
+    assert np.any(expected_gradient["head"]["kernel"])
+    for a, b in zip(*map(jax.tree.leaves, (gradient, expected_gradient)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-6)
+
+
+def test_updates_are_adam_and_polyak(problem):
+    variant, learner, batch = problem
+    y = td3.target(learner, variant, batch, jax.random.key(2), _numbers(), BOUNDS)
+    updated, loss = td3.update_critics(
+        learner, variant, batch, jax.random.key(2), _numbers(), BOUNDS
+    )
+    with jax.numpy_dtype_promotion("standard"):
+        adam = optax.adam(2e-2)
+        gradient = jax.grad(td3.critic_loss)(learner.critics, variant, batch, y)
+        steps, _ = adam.update(gradient, adam.init(learner.critics))
+    expected = optax.apply_updates(learner.critics, steps)
+    for a, b in zip(*map(jax.tree.leaves, (updated.critics, expected)), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-6)
+    assert updated.actor is learner.actor and updated.target_critics is learner.target_critics
+    assert float(loss) == pytest.approx(
+        float(td3.critic_loss(learner.critics, variant, batch, y)), rel=1e-6
+    )
+
+    after = td3.update_actor_and_targets(updated, variant, batch, _numbers(), BOUNDS)
+    triples = (
+        (after.actor, learner.target_actor, after.target_actor),
+        (updated.critics, learner.target_critics, after.target_critics),
+    )
+    for online, before, target in triples:
+        for o, b, t in zip(*map(jax.tree.leaves, (online, before, target)), strict=True):
+            np.testing.assert_allclose(t, 0.9 * np.asarray(b) + 0.1 * np.asarray(o), atol=1e-6)
+    assert not np.allclose(after.actor["head"]["kernel"], learner.actor["head"]["kernel"])
+
+
+def test_exploration_is_relative_to_half_the_range_and_stays_within():
+    action = jnp.zeros((20_000, 1))
+    noisy = td3.explore(jax.random.key(0), action, jnp.float32(0.1), BOUNDS)
+    assert float(jnp.std(noisy)) == pytest.approx(0.3, rel=0.02)
+    wild = td3.explore(jax.random.key(0), action, jnp.float32(10.0), BOUNDS)
+    assert float(wild.min()) == -2.0 and float(wild.max()) == 4.0

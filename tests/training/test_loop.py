@@ -1,0 +1,113 @@
+"""What a lane stores as it goes: boundaries, final observations, carries."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+from gymnax.environments import environment, spaces
+
+from rtd3jax.agents.networks import carry_before
+from rtd3jax.agents.replay import gather
+from rtd3jax.agents.variants import VARIANTS
+from rtd3jax.config import Config
+from rtd3jax.training.loop import make_lane, make_program
+
+STEPS = 60
+
+
+@struct.dataclass
+class State:
+    time: jax.Array
+    episode: jax.Array
+
+
+class Clock(environment.Environment):
+    """Shows (a random number of the episode, steps since its start); ends after 7 steps, or 4.
+
+    Episodes whose number is odd terminate after 4 steps; the others are cut after 7.
+    """
+
+    @property
+    def default_params(self):
+        return environment.EnvParams(max_steps_in_episode=7)
+
+    def _see(self, state):
+        return jnp.stack((state.episode, state.time)).astype(jnp.float32)
+
+    def reset_env(self, key, params):
+        state = State(jnp.int32(0), jax.random.randint(key, (), 0, 1000, jnp.int32))
+        return self._see(state), state
+
+    def step_env(self, key, state, action, params):
+        state = State(state.time + jnp.int32(1), state.episode)
+        terminated = (state.episode % 2 == 1) & (state.time == 4)
+        return self._see(state), state, jnp.sum(action) * 1.0, terminated, {}
+
+    def action_space(self, params):
+        return spaces.Box(-1.0, 1.0, (1,))
+
+
+@pytest.fixture(scope="module")
+def lane():
+    """h-td3 that never learns, so that every stored carry can be computed again."""
+    env = Clock()
+    config = Config(
+        algorithm="h-td3",
+        history_length=3,
+        total_steps=STEPS,
+        hidden_size=4,
+        batch_size=4,
+        learning_starts=STEPS,
+        eval_every=STEPS,
+        eval_episodes=1,
+    )
+    program = make_program(env, config, 2, (1,))
+    lane = make_lane(config, 0, env.default_params)
+    start = program.init(lane)
+    # Cut unevenly: chunks must not matter.
+    state = start
+    advance = jax.jit(program.advance)
+    for begin, end in ((0, 1), (1, 20), (20, STEPS)):
+        state = advance(lane, state, jnp.int32(begin), jnp.int32(end))
+    return program, lane, state
+
+
+@pytest.fixture(scope="module")
+def rows(lane):
+    return jax.tree.map(np.asarray, lane[2].replay.transitions)
+
+
+def test_next_observations_belong_to_the_same_episode(rows):
+    seen, then = rows.step.observation, rows.next_observation
+    np.testing.assert_array_equal(then[:, 0], seen[:, 0])
+    np.testing.assert_array_equal(then[:, 1], seen[:, 1] + 1)
+
+
+def test_ages_and_previous_actions_start_anew_with_each_episode(rows):
+    np.testing.assert_array_equal(rows.age, rows.step.observation[:, 1])
+    first = rows.age == 0
+    assert first.sum() > 8 and not rows.step.previous_action[first].any()
+    later = np.flatnonzero(~first)
+    np.testing.assert_array_equal(rows.step.previous_action[later], rows.step.action[later - 1])
+
+
+def test_only_terminations_are_marked_terminated(rows):
+    odd, age = rows.step.observation[:, 0] % 2 == 1, rows.age
+    np.testing.assert_array_equal(rows.terminated, odd & (age == 3))
+    assert rows.terminated.any() and (age == 6).any()
+
+
+def test_stored_carries_are_the_actors_own(lane):
+    _, _, state = lane
+    # The newest row's next carry is known only once the agent has acted again.
+    numbers = jnp.arange(STEPS - 1, dtype=jnp.int32)
+    batch = gather(state.replay, numbers, jnp.int32(STEPS), 3, 3)
+    actor, spec = state.learner.actor, VARIANTS["h-td3"].actor
+    for stored, window in ((batch.carry, batch.window), (batch.next_carry, batch.next_window)):
+        for got, want in zip(stored, carry_before(actor, spec, window), strict=True):
+            np.testing.assert_allclose(got, want, atol=1e-6)
+
+
+def test_the_last_evaluation_is_at_the_end(lane):
+    assert np.isfinite(np.asarray(lane[2].returns)).all() and lane[0].evaluations == 1
