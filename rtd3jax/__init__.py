@@ -1,6 +1,7 @@
 """Recurrent TD3 agents for plants whose disturbance is hidden and evolves."""
 
 from rtd3jax.agents.networks import count_parameters
+from rtd3jax.ceilings import Ceiling, bayes_policy, ceiling
 from rtd3jax.config import ALGORITHMS, Config
 from rtd3jax.envs.registry import DISTURBANCES, ENVIRONMENTS, make, register
 from rtd3jax.errors import UserError
@@ -12,11 +13,14 @@ __all__ = [
     "ALGORITHMS",
     "DISTURBANCES",
     "ENVIRONMENTS",
+    "Ceiling",
     "Config",
     "Failure",
     "Policy",
     "Run",
     "UserError",
+    "bayes_policy",
+    "ceiling",
     "constant_policy",
     "count_parameters",
     "evaluate",

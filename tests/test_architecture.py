@@ -15,6 +15,7 @@ LAYERS = {
     "agents": 2,
     "policy": 3,
     "evaluate": 4,
+    "ceilings": 5,
     "training": 5,
     "study": 6,
     "sweep": 7,
