@@ -5,9 +5,11 @@ side. The same command again trains what is missing.
 """
 
 import argparse
+import collections
 import dataclasses
 import json
 import os
+import re
 import sys
 import time
 from collections.abc import Sequence
@@ -22,13 +24,18 @@ from rtd3jax.envs.registry import DISTURBANCES, ENVIRONMENTS
 from rtd3jax.errors import UserError
 from rtd3jax.evaluate import evaluate
 from rtd3jax.policy import constant_policy, random_policy
+from rtd3jax.study.lock import parse_shard, writer
 from rtd3jax.study.plan import PRESETS, Cell, Grid, cell_jobs, estimate, lane_bytes, make_cells
 from rtd3jax.study.rundir import Reference, RunDirectory
+from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.lanes import Group, Job, advance_groups, make_groups, workers
 from rtd3jax.training.progress import Progress
 from rtd3jax.training.run import check_strategy, curves_of, evaluation_steps, failure_of
 
 REFERENCE_EPISODES = 1_000
+_EARLY_ANSWERS_SECONDS = 60.0
+"""At most so often are tables and pictures made while the sweep runs."""
+
 _GRID_FIELDS = ("algorithm", "history_length")
 
 
@@ -42,9 +49,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except OSError as error:
+        # A full disk, say. What was written before is whole, and the same command goes on from it.
+        print(f"error: {error.filename or _out(options)}: {error.strerror}", file=sys.stderr)
+        return 2
 
 
 def _run(options: argparse.Namespace) -> int:
+    if options.status:
+        return _status(_out(options))
     cells = make_cells(_grids(options), _overrides(options))
     seeds = list(range(_positive("seeds", options.seeds)))
     episodes = _positive("final_episodes", options.final_episodes)
@@ -54,58 +67,86 @@ def _run(options: argparse.Namespace) -> int:
         print(_plan_text(cells, seeds, jobs))
         return 0
     _check_memory(jobs)
-    directory = RunDirectory(_out(options), cells, seeds, episodes)
+    out = _out(options)
+    shard = None if options.shard is None else parse_shard(options.shard)
+    if options.fresh:
+        _set_aside(out)
+    directory = RunDirectory(out, cells, seeds, episodes)
+    checkpoints = _checkpoints(directory, options.checkpoint_every)
+    with writer(directory.path, shard):
+        return _train(directory, _share(jobs, shard), strategy, checkpoints, options.quiet)
+
+
+def _share(jobs: list[Job], shard: tuple[int, int] | None) -> list[Job]:
+    """A shard's lanes: every n-th, so that the shares cost about the same."""
+    return jobs if shard is None else jobs[shard[0] - 1 :: shard[1]]
+
+
+def _train(
+    directory: RunDirectory, jobs: list[Job], strategy: str, checkpoints: Checkpoints, quiet: bool
+) -> int:
     waiting = [job for job in jobs if not directory.is_done(*job.owner)]
     if len(waiting) < len(jobs):
         print(f"{len(jobs) - len(waiting)} of {len(jobs)} lanes are there already")
-    lost = interrupted = False
+    for job in waiting:
+        directory.error_path(*job.owner).unlink(missing_ok=True)
+    interrupted = False
     groups = make_groups(waiting, strategy, len(workers()))
-    recorder = _Recorder(directory, episodes)
-    references = [r for cell in _worlds(cells) for r in _references(cell)]
+    references = [r for cell in _worlds(directory.cells) for r in _references(cell)]
+    recorder = _Recorder(directory, checkpoints, references)
     try:
-        with Progress(groups, _label, enabled=not options.quiet) as bar:
+        with Progress(groups, _label, enabled=not quiet) as bar:
 
             def on_chunk(group: Group) -> None:
                 bar.update(group)
                 recorder.update(group)
 
-            advance_groups(groups, on_chunk)
+            advance_groups(groups, on_chunk, checkpoints)
     except KeyboardInterrupt:
         interrupted = True
     directory.derive(references)
-    for line in recorder.complaints:
-        print(line, file=sys.stderr)
-        lost = True
     print((directory.path / "summary.md").read_text())
     print(f"results: {directory.path}")
     if interrupted:
         print("interrupted: the same command goes on with the lanes that are missing")
         return 130
-    return 1 if lost else 0
+    for line in recorder.complaints:
+        print(line, file=sys.stderr)
+    return 1 if recorder.complaints else 0
 
 
 class _Recorder:
     """Writes lanes down as they end, and the log as they go."""
 
-    def __init__(self, directory: RunDirectory, episodes: int):
+    def __init__(
+        self, directory: RunDirectory, checkpoints: Checkpoints, references: list[Reference]
+    ):
         self._directory = directory
-        self._episodes = episodes
+        self._checkpoints = checkpoints
+        self._references = references
+        self._derived = time.perf_counter()
         self._logged: dict[int, int] = {}
         self._began = time.perf_counter()
         self.complaints: list[str] = []
 
     def update(self, group: Group) -> None:
         if group.error is not None:
-            cell, seed = group.jobs[0].owner
             reason = str(group.error).splitlines()[0] if str(group.error) else repr(group.error)
-            self.complaints.append(f"{_label(group.jobs[0])} seed {seed} failed: {reason}")
+            for job in group.jobs:
+                cell, seed = job.owner
+                self._directory.write_error(cell, seed, reason)
+                self.complaints.append(f"{_label(job)} seed {seed} failed: {reason}")
             return
         self._log(group)
         # An event may be read late, after the one that already kept the group.
         if group.finished and group.state is not None:
             for job, state in group.lanes():
                 self._keep(job, state)
+                self._checkpoints.discard(job)
             group.state = None  # its replay is no longer needed
+            if time.perf_counter() - self._derived > _EARLY_ANSWERS_SECONDS:
+                self._directory.derive(self._references)
+                self._derived = time.perf_counter()
 
     def _log(self, group: Group) -> None:
         assert group.returns is not None
@@ -129,10 +170,10 @@ class _Recorder:
         cell, seed = job.owner
         failure = failure_of(seed, state)
         returns, true_returns = curves_of(cell.config, state, failure)
-        final = np.full((2, self._episodes), np.nan, np.float32)
+        final = np.full((2, self._directory.episodes), np.nan, np.float32)
         if failure is None:
             policy = job.program.policy(job.lane, state.learner.actor)
-            final = np.stack(_both_returns(policy, cell.make_env(), self._episodes, seed))
+            final = np.stack(_both_returns(policy, cell.make_env(), self._directory.episodes, seed))
         else:
             self.complaints.append(
                 f"{_label(job)} seed {seed} was lost at step {failure.step}: {failure.reason}"
@@ -150,6 +191,55 @@ class _Recorder:
             },
             None if failure is None else {"step": failure.step, "reason": failure.reason},
         )
+
+
+def _checkpoints(directory: RunDirectory, every: str) -> Checkpoints:
+    seconds, steps = _parse_interval(every)
+
+    def identity(job: Job) -> dict[str, Any]:
+        cell, seed = job.owner
+        return {**cell.to_dict(), "seed": seed, "window": job.program.tokens}
+
+    return Checkpoints(
+        lambda job: directory.checkpoint_directory(*job.owner), identity, seconds, steps
+    )
+
+
+def _parse_interval(text: str) -> tuple[float | None, int | None]:
+    """``"300s"``, ``"5m"`` or ``"2000steps"`` as (seconds, None) or (None, steps)."""
+    match = re.fullmatch(r"(\d{1,9})\s*(s|m|h|steps)?", text.strip())
+    if match is None or int(match[1]) < 1:
+        raise UserError(f"--checkpoint-every {text!r} is not like 300s, 5m, 1h or 2000steps")
+    if match[2] == "steps":
+        return None, int(match[1])
+    return float(match[1]) * {"m": 60, "h": 3600}.get(match[2], 1), None
+
+
+def _set_aside(out: Path) -> None:
+    """Move a run directory away: what was trained is kept under another name."""
+    if not (out / "config.json").exists():
+        return
+    with writer(out, None):
+        for number in range(1, 10_000):
+            aside = out.with_name(f"{out.name}.old-{number}")
+            if not aside.exists():
+                out.rename(aside)
+                print(f"what was there is now {aside}")
+                return
+
+
+def _status(out: Path) -> int:
+    directory = RunDirectory.open(out)
+    ledger = directory.ledger()
+    for row in ledger:
+        length = f"l={row['history_length']}"
+        print(
+            f"{row['env']:10} {row['disturbance']:24} {row['algorithm']:20} {length:5} "
+            f"seed {row['seed']:<4} {row['status']:9} {row['step']:>10,}  {row['reason']}"
+        )
+    counts = collections.Counter(row["status"] for row in ledger)
+    print(", ".join(f"{count} {status}" for status, count in counts.items()))
+    return 1 if counts["failed"] or counts["lost"] else 0
 
 
 def _both_returns(policy: Any, env: Any, episodes: int, seed: int) -> list[np.ndarray]:
@@ -238,6 +328,8 @@ def _overrides(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _out(options: argparse.Namespace) -> Path:
+    if not (options.out or options.preset or options.env):
+        raise UserError("say where: --out DIR")
     return Path(options.out or Path("runs") / (options.preset or options.env))
 
 
@@ -295,6 +387,14 @@ def _parser() -> argparse.ArgumentParser:
     )
     work = parser.add_argument_group("the work")
     work.add_argument("--out", metavar="DIR", help="run directory [runs/PRESET or runs/ENV]")
+    work.add_argument("--status", action="store_true", help="what is done in --out, lane by lane")
+    work.add_argument(
+        "--fresh", action="store_true", help="start over; what was there is kept as DIR.old-N"
+    )
+    work.add_argument("--shard", metavar="I/N", help="this process takes the I-th of N shares")
+    work.add_argument(
+        "--checkpoint-every", default="5m", metavar="T", help="300s, 5m, 1h or 2000steps [5m]"
+    )
     work.add_argument("--dry-run", action="store_true", help="print the plan and its cost")
     work.add_argument("--quiet", action="store_true", help="no progress bar")
     work.add_argument("--device", choices=("cpu", "gpu", "tpu"), help="where to run [the best]")

@@ -10,6 +10,7 @@ import rtd3jax
 ROOT = pathlib.Path(rtd3jax.__file__).parent
 LAYERS = {
     "errors": 0,
+    "files": 1,
     "config": 1,
     "envs": 2,
     "agents": 2,

@@ -129,3 +129,98 @@ def test_presets_have_the_papers_cells():
     assert len(make_cells(PRESETS["rover"], {})) == 18
     # Four disturbances: five agents at five lengths and td3; two disturbances: two agents.
     assert len(make_cells(PRESETS["pendulum"], {})) == 4 * 26 + 2 * 10
+
+
+def test_status_names_every_lane(tmp_path, capsys):
+    out = str(tmp_path / "run")
+    assert sweep.main(["--out", out, "--status"]) == 2
+    assert "there is no study" in capsys.readouterr().err
+    assert sweep.main([*TINY, "--out", out]) == 0
+    next((tmp_path / "run").glob("lanes/*td3_l0/seed-1.safetensors")).unlink()
+    capsys.readouterr()
+    assert sweep.main(["--out", out, "--status"]) == 0
+    assert "3 done, 1 planned" in capsys.readouterr().out.replace(
+        "1 planned, 3 done", "3 done, 1 planned"
+    )
+
+
+def test_fresh_keeps_what_was_there(tmp_path, capsys):
+    out = tmp_path / "run"
+    assert sweep.main([*TINY, "--out", str(out)]) == 0
+    changed = [*TINY, "--out", str(out), "--fresh", "--gamma", "0.5"]
+    assert sweep.main(changed) == 0
+    assert (tmp_path / "run.old-1" / "curves.parquet").exists()
+    assert "0.5" in (out / "summary.md").read_text()
+
+
+def test_shards_fill_one_directory_with_the_same_tables(tmp_path):
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    assert sweep.main([*TINY, "--out", str(whole)]) == 0
+    for shard in ("1/3", "2/3", "3/3"):
+        assert sweep.main([*TINY, "--out", str(parts), "--shard", shard]) == 0
+    names = "curves.parquet", "episodes.parquet", "summary.md"
+    assert _files(whole, *names) == _files(parts, *names)
+
+
+@pytest.mark.parametrize("shard", ["0/2", "3/2", "a", "1/0", "-1/2"])
+def test_impossible_shards_are_refused(shard, tmp_path, capsys):
+    assert sweep.main([*TINY, "--out", str(tmp_path / "run"), f"--shard={shard}"]) == 2
+    assert "not of the form i/n" in capsys.readouterr().err
+
+
+def test_a_second_writer_is_refused_and_a_dead_one_is_not_in_the_way(tmp_path, capsys):
+    from rtd3jax.study.lock import writer
+
+    out = tmp_path / "run"
+    out.mkdir()
+    with writer(out, (1, 2)):
+        assert sweep.main([*TINY, "--out", str(out)]) == 2
+        assert "another process is writing to it" in capsys.readouterr().err
+        assert sweep.main([*TINY, "--out", str(out), "--shard", "1/2"]) == 2
+        assert "another process is writing shard 1/2" in capsys.readouterr().err
+        assert sweep.main([*TINY, "--out", str(out), "--shard", "2/2"]) == 0
+    assert sweep.main([*TINY, "--out", str(out)]) == 0
+
+
+def test_a_cell_that_raises_does_not_stop_the_others(tmp_path, monkeypatch, capsys):
+    from rtd3jax.training import lanes
+
+    real = lanes._chunk
+
+    def chunk(group, *rest):
+        cell, seed = group.jobs[0].owner
+        if cell.config.algorithm == "td3" and seed == 1:
+            raise RuntimeError("the plant is on fire\nand more")
+        real(group, *rest)
+
+    monkeypatch.setattr(lanes, "_chunk", chunk)
+    out = tmp_path / "run"
+    assert sweep.main([*TINY, "--out", str(out)]) == 1
+    assert "seed 1 failed: the plant is on fire" in capsys.readouterr().err
+    assert sweep.main(["--out", str(out), "--status"]) == 1
+    assert "failed             0  the plant is on fire" in capsys.readouterr().out
+    monkeypatch.setattr(lanes, "_chunk", real)
+    assert sweep.main([*TINY, "--out", str(out)]) == 0
+
+
+def test_a_full_disk_is_one_line_and_loses_nothing(tmp_path, monkeypatch, capsys):
+    import errno
+
+    from rtd3jax import files
+
+    real, written = files.os.fsync, []
+
+    def fsync(handle):
+        written.append(handle)
+        if len(written) > 3:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        real(handle)
+
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(files.os, "fsync", fsync)
+        assert sweep.main([*TINY, "--out", str(out)]) == 2
+    error = capsys.readouterr().err
+    assert "No space left on device" in error and error.count("\n") == 1
+    assert not list(out.rglob("*.tmp"))
+    assert sweep.main([*TINY, "--out", str(out)]) == 0

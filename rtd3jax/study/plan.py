@@ -57,7 +57,14 @@ class Cell:
         """As in config.json."""
         return {"env": self.env, "disturbance": self.disturbance, **self.config.to_dict()}
 
+    @classmethod
+    def from_dict(cls, fields: dict[str, Any]) -> "Cell":
+        """The cell that `to_dict` wrote."""
+        config = {name: value for name, value in fields.items() if name not in _OWN_FIELDS}
+        return cls(fields["env"], fields["disturbance"], Config(**config))
 
+
+_OWN_FIELDS = ("env", "disturbance")
 ALL_AGENTS = tuple(VARIANTS)
 LENGTHS = (1, 3, 6, 10, 20)
 

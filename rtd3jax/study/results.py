@@ -7,7 +7,6 @@ in which training lanes finished.
 
 import io
 import os
-import uuid
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -17,6 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from rtd3jax.errors import UserError
+from rtd3jax.files import write_bytes_atomically
 
 # Untrained policies evaluated for comparison. Their EPISODES rows carry history_length 0 and a
 # negative seed, because neither has a meaning for them.
@@ -53,23 +53,6 @@ EPISODES = _schema(pa.field("episode", pa.int32(), nullable=False))
 def key_columns(schema: pa.Schema) -> list[str]:
     """Names of the columns that identify a row: all but the floating-point measurements."""
     return [field.name for field in schema if not pa.types.is_floating(field.type)]
-
-
-def write_bytes_atomically(path: str | os.PathLike, data: bytes) -> None:
-    """Put ``data`` at ``path`` so that a reader, or a crash, sees the old or the new file whole."""
-    path = Path(path)
-    # In the same directory, since os.replace is atomic only within one file system.
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with open(temporary, "xb") as stream:
-            stream.write(data)
-            stream.flush()
-            # Without this the rename may reach the disk before the contents do.
-            os.fsync(stream.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def write_table(

@@ -16,10 +16,9 @@ from typing import Any
 
 import jax
 import numpy as np
-from safetensors import SafetensorError
-from safetensors.numpy import load_file, save
 
 from rtd3jax.errors import UserError
+from rtd3jax.files import read_arrays, write_arrays, write_bytes_atomically
 from rtd3jax.study.figures import final_returns, learning_curves
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.results import (
@@ -27,11 +26,13 @@ from rtd3jax.study.results import (
     EPISODES,
     REFERENCES,
     read_table,
-    write_bytes_atomically,
     write_table,
 )
 from rtd3jax.study.summary import summary_markdown
+from rtd3jax.training.checkpoint import checkpoint_steps
 
+_CURVE_ARRAYS = ("steps", "returns", "true_returns")
+_FINAL_ARRAYS = ("final_returns", "final_true_returns")
 _PACKAGES = ("rtd3jax", "jax", "jaxlib", "flax", "optax", "gymnax", "numpy")
 
 
@@ -59,12 +60,23 @@ class RunDirectory:
         self.path = Path(path)
         self.cells = list(cells)
         self.seeds = list(seeds)
+        self.episodes = episodes
         self._study = {
             "cells": [cell.to_dict() for cell in cells],
             "seeds": list(seeds),
             "final_episodes": episodes,
         }
         self._open()
+
+    @classmethod
+    def open(cls, path: str | Path) -> "RunDirectory":
+        """The study that is in ``path`` already."""
+        study = _read_study(Path(path) / "config.json")
+        try:
+            cells = [Cell.from_dict(cell) for cell in study["cells"]]
+            return cls(path, cells, study["seeds"], study["final_episodes"])
+        except (KeyError, TypeError) as error:
+            raise UserError(f"{path}/config.json is not a study's configuration") from error
 
     def _open(self) -> None:
         config = self.path / "config.json"
@@ -73,7 +85,7 @@ class RunDirectory:
             if config.exists():
                 self._check_same(config)
                 return
-            if any(self.path.iterdir()):
+            if any(not entry.name.startswith(".lock") for entry in self.path.iterdir()):
                 raise UserError(
                     f"--out {self.path} is not empty and holds no study; choose another directory"
                 )
@@ -83,10 +95,7 @@ class RunDirectory:
             raise UserError(f"--out {self.path} cannot be written: {error.strerror}") from error
 
     def _check_same(self, config: Path) -> None:
-        try:
-            study = json.loads(config.read_text())["study"]
-        except (ValueError, KeyError, TypeError) as error:
-            raise UserError(f"{config} is not a study's configuration ({error})") from error
+        study = _read_study(config)
         if study != json.loads(json.dumps(self._study)):
             raise UserError(
                 f"--out {self.path} holds another study ({_difference(study, self._study)}); "
@@ -96,6 +105,14 @@ class RunDirectory:
     def lane_path(self, cell: Cell, seed: int) -> Path:
         """Where a lane's file is."""
         return self.path / "lanes" / cell_name(cell) / f"seed-{seed}.safetensors"
+
+    def checkpoint_directory(self, cell: Cell, seed: int) -> Path:
+        """Where a lane that is under way keeps its checkpoints."""
+        return self.path / "checkpoints" / cell_name(cell) / f"seed-{seed}"
+
+    def error_path(self, cell: Cell, seed: int) -> Path:
+        """Where the reason stands for which a lane could not be trained."""
+        return self.lane_path(cell, seed).with_suffix(".error.txt")
 
     def is_done(self, cell: Cell, seed: int) -> bool:
         """Whether the lane was trained to its end."""
@@ -121,12 +138,33 @@ class RunDirectory:
         """
         arrays = {f"actor.{name}": value for name, value in flatten(actor).items()}
         arrays |= {f"results.{name}": np.asarray(value) for name, value in curves.items()}
-        # One entry, because several would be written in no fixed order.
-        lane = {"cell": cell.to_dict(), "seed": seed, "failure": failure}
-        metadata = {"rtd3jax": json.dumps(lane)}
-        path = self.lane_path(cell, seed)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_bytes_atomically(path, save(arrays, metadata))
+        about = {"cell": cell.to_dict(), "seed": seed, "failure": failure}
+        write_arrays(self.lane_path(cell, seed), arrays, about)
+
+    def write_error(self, cell: Cell, seed: int, reason: str) -> None:
+        """Keep the reason for which a lane could not be trained."""
+        write_bytes_atomically(self.error_path(cell, seed), (reason + "\n").encode())
+
+    def ledger(self) -> list[dict[str, Any]]:
+        """Each lane's state: done, lost, failed, under way (at a step), or planned."""
+        return [
+            {**cell.key, "seed": seed, **self._lane_status(cell, seed)}
+            for cell in self.cells
+            for seed in self.seeds
+        ]
+
+    def _lane_status(self, cell: Cell, seed: int) -> dict[str, Any]:
+        if self.is_done(cell, seed):
+            failure = read_arrays(self.lane_path(cell, seed))[1]["failure"]
+            if failure is not None:
+                return {"status": "lost", "step": failure["step"], "reason": failure["reason"]}
+            return {"status": "done", "step": cell.config.total_steps, "reason": ""}
+        if self.error_path(cell, seed).exists():
+            reason = self.error_path(cell, seed).read_text().strip()
+            return {"status": "failed", "step": 0, "reason": reason}
+        steps = checkpoint_steps(self.checkpoint_directory(cell, seed))
+        status = "under way" if steps else "planned"
+        return {"status": status, "step": max(steps, default=0), "reason": ""}
 
     def derive(self, references: Iterable[Reference], *, pictures: bool = True) -> None:
         """Write tables, pictures and the summary of the lanes there are."""
@@ -151,26 +189,23 @@ class RunDirectory:
 
     def _read_lane(self, cell: Cell, seed: int, curves: list, episodes: list, failures: list):
         path = self.lane_path(cell, seed)
+        row = {**cell.key, "seed": seed}
         try:
-            arrays = load_file(path)
-            metadata = _metadata(path)
-            failure = json.loads(metadata["rtd3jax"])["failure"]
-            row = {**cell.key, "seed": seed}
-            for step, value, true in zip(
-                arrays["results.steps"],
-                arrays["results.returns"],
-                arrays["results.true_returns"],
-                strict=True,
-            ):
-                curves.append({**row, "step": int(step), "return": value, "true_return": true})
-            pairs = zip(
-                arrays["results.final_returns"], arrays["results.final_true_returns"], strict=True
-            )
-            for episode, (value, true) in enumerate(pairs):
-                episodes.append({**row, "episode": episode, "return": value, "true_return": true})
-        except (OSError, SafetensorError, KeyError, ValueError, TypeError) as error:
+            arrays, about = read_arrays(path)
+            failure = about["failure"]
+            points = zip(*(arrays[f"results.{n}"] for n in _CURVE_ARRAYS), strict=True)
+            finals = zip(*(arrays[f"results.{n}"] for n in _FINAL_ARRAYS), strict=True)
+            curves += [
+                {**row, "step": int(step), "return": value, "true_return": true}
+                for step, value, true in points
+            ]
+            episodes += [
+                {**row, "episode": episode, "return": value, "true_return": true}
+                for episode, (value, true) in enumerate(finals)
+            ]
+        except (UserError, KeyError, ValueError, TypeError) as error:
             raise UserError(
-                f"{path} cannot be read ({error}); remove it, and the same command trains it again"
+                f"{error}: remove {path}, and the same command trains that lane again"
             ) from error
         if failure is not None:
             failures.append({**row, **failure})
@@ -191,6 +226,15 @@ class RunDirectory:
         }
 
 
+def _read_study(config: Path) -> Any:
+    try:
+        return json.loads(config.read_text())["study"]
+    except OSError as error:
+        raise UserError(f"there is no study in {config.parent} ({error.strerror})") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{config} is not a study's configuration") from error
+
+
 def cell_name(cell: Cell) -> str:
     """A directory name that tells cells apart."""
     text = f"{cell.env}_{cell.disturbance}_{cell.config.algorithm}_l{cell.config.history_length}"
@@ -205,13 +249,6 @@ def flatten(tree: Any, prefix: str = "") -> dict[str, np.ndarray]:
     for name, value in tree.items():
         flat |= flatten(value, f"{prefix}.{name}" if prefix else name)
     return flat
-
-
-def _metadata(path: Path) -> dict[str, str]:
-    from safetensors import safe_open
-
-    with safe_open(path, "numpy") as file:
-        return file.metadata()
 
 
 def _reference_rows(reference: Reference) -> list[dict[str, Any]]:

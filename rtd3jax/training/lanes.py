@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.loop import HEALTHY, Lane, LaneState, Program
 
 CHUNK_SECONDS = 1.0
@@ -120,15 +121,17 @@ def make_groups(jobs: Sequence[Job], strategy: str, devices: int) -> list[Group]
 def advance_groups(
     groups: Sequence[Group],
     on_chunk: Callable[[Group], None],
+    checkpoints: Checkpoints | None = None,
 ) -> None:
     """Advance every group to its end, calling ``on_chunk`` in this thread after each chunk.
 
     A group that raises keeps its error and does not touch the others. An interrupt stops the
-    workers after their current chunks and is raised again.
+    workers after their current chunks and is raised again. With ``checkpoints``, groups go on from
+    where theirs were, write them as they go, and once more when they are interrupted.
     """
     pool = _Pool(groups)
     threads = [
-        threading.Thread(target=_work, args=(pool, device), daemon=True)
+        threading.Thread(target=_work, args=(pool, device, checkpoints), daemon=True)
         for device in workers()[: max(1, len(groups))]
     ]
     for thread in threads:
@@ -140,6 +143,10 @@ def advance_groups(
         pool.stop()
         for thread in threads:
             thread.join()
+        if checkpoints is not None:
+            for group in groups:
+                if group.state is not None and not group.finished:
+                    checkpoints.save(group.lanes(), group, group.step)
 
 
 class _Pool:
@@ -194,15 +201,35 @@ class _Pool:
             self._changed.notify_all()
 
 
-def _work(pool: _Pool, device: Any) -> None:
+def _work(pool: _Pool, device: Any, checkpoints: Checkpoints | None) -> None:
     """A device's worker: chunks of the lagging group, as long as there is one."""
     rates: dict[Any, float] = {}
     while (group := pool.take()) is not None:
         try:
-            _chunk(group, device, rates)
+            if checkpoints is not None and group.state is None:
+                _restore(group, checkpoints)
+            if not group.finished:
+                _chunk(group, device, rates)
+            if checkpoints is not None and not group.finished and checkpoints.is_due(group):
+                checkpoints.save(group.lanes(), group, group.step)
         except BaseException as error:  # contained: the others go on
             group.error = error
         pool.give_back(group)
+
+
+def _restore(group: Group, checkpoints: Checkpoints) -> None:
+    found = checkpoints.restore(group.jobs)
+    if found is not None:
+        states, step = found
+        single = len(states) == 1
+        state = states[0] if single else jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+        _advanced(group, state, step)
+
+
+def _advanced(group: Group, state: LaneState, step: int) -> None:
+    group.returns = np.atleast_2d(np.asarray(state.returns))
+    group.lost = bool(np.all(np.asarray(state.failure) != HEALTHY))
+    group.state, group.step = state, step
 
 
 def _chunk(group: Group, device: Any, rates: dict[Any, float]) -> None:
@@ -225,9 +252,7 @@ def _chunk(group: Group, device: Any, rates: dict[Any, float]) -> None:
     seconds = time.perf_counter() - began
     if group.step >= warm_up:
         rates[program, width] = (stop - group.step) / seconds
-    group.returns = np.atleast_2d(np.asarray(state.returns))
-    group.lost = bool(np.all(np.asarray(state.failure) != HEALTHY))
-    group.state, group.step = state, stop
+    _advanced(group, state, stop)
 
 
 class _Compiled:

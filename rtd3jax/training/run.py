@@ -2,14 +2,17 @@
 
 import dataclasses
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from rtd3jax.config import Config
 from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
 from rtd3jax.policy import Policy
+from rtd3jax.training.checkpoint import DEFAULT_SECONDS, Checkpoints
 from rtd3jax.training.lanes import (
     Group,
     Job,
@@ -88,6 +91,8 @@ def train(
     params: Any = None,
     progress: bool = True,
     strategy: str | None = None,
+    checkpoint_dir: str | Path | None = None,
+    checkpoint_seconds: float = DEFAULT_SECONDS,
 ) -> Run:
     """Train one lane per seed.
 
@@ -97,6 +102,9 @@ def train(
         seeds: distinct integers of at least 0; a seed's result does not depend on the others.
         params: the environment's parameters; its own by default.
         progress: whether to show a bar.
+        checkpoint_dir: where lanes keep checkpoints. The same call again goes on from them, to the
+            bit; seeds that were finished are not trained again.
+        checkpoint_seconds: between two checkpoints of a lane.
         strategy: ``map`` (lanes one by one, each on one core) or ``vmap`` (side by side); by
             default what suits the backend.
 
@@ -107,9 +115,26 @@ def train(
     jobs = make_jobs(env, config, seeds, params=params)
     groups = make_groups(jobs, check_strategy(strategy), len(workers()))
     label = f"{config.algorithm} l={config.history_length}"
+    checkpoints = None
+    if checkpoint_dir is not None:
+        checkpoints = _checkpoints(Path(checkpoint_dir), config, env, checkpoint_seconds)
     with Progress(groups, lambda job: label, enabled=progress) as bar:
-        advance_groups(groups, bar.update)
+        advance_groups(groups, bar.update, checkpoints)
+    if checkpoints is not None:
+        for group in groups:
+            if group.error is None:
+                checkpoints.save(group.lanes(), group, group.step)
     return collect(config, seeds, groups)
+
+
+def _checkpoints(directory: Path, config: Config, env: Any, seconds: float) -> Checkpoints:
+    world = {"env": str(getattr(env, "name", type(env).__name__)), "params": None}
+
+    def identity(job: Job) -> dict[str, Any]:
+        params = [np.asarray(leaf).tolist() for leaf in jax.tree.leaves(job.lane.env_params)]
+        return {**config.to_dict(), **world, "params": params, "seed": job.owner[1]}
+
+    return Checkpoints(lambda job: directory / f"seed-{job.owner[1]}", identity, seconds)
 
 
 def make_jobs(

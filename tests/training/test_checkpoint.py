@@ -1,0 +1,147 @@
+"""A lane that goes on from a checkpoint ends with the same bits; a bad checkpoint is named."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+import rtd3jax as rtd
+from rtd3jax.training import lanes, run
+
+CONFIG = rtd.Config(
+    algorithm="h-td3",
+    history_length=2,
+    total_steps=120,
+    hidden_size=4,
+    batch_size=4,
+    learning_starts=20,
+    eval_every=40,
+    eval_episodes=2,
+)
+SEEDS = [0, 1, 2]
+
+
+def _env():
+    return rtd.make("rover", disturbance="ar1-slip")
+
+
+def _train(directory=None, config=CONFIG, env=None, **options):
+    return rtd.train(
+        env or _env(), config, SEEDS, progress=False, checkpoint_dir=directory, **options
+    )
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return _train()
+
+
+@pytest.fixture
+def stopped(tmp_path, monkeypatch):
+    """A directory of checkpoints of a training that was interrupted, with chunks of few steps."""
+    chunks = []
+
+    def interrupt(_):
+        chunks.append(1)
+        if len(chunks) == 7:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(lanes, "_FIRST_CHUNK", 13)
+        patch.setattr(lanes, "CHUNK_SECONDS", 0.0)
+        patch.setattr(run.Progress, "update", lambda self, group: interrupt(group))
+        with pytest.raises(KeyboardInterrupt):
+            _train(tmp_path, checkpoint_seconds=0.0)
+    files = list(tmp_path.rglob("*.safetensors"))
+    assert files and not any("000000120" in file.name for file in files)
+    return tmp_path
+
+
+def _assert_same(one, other):
+    np.testing.assert_array_equal(one.returns, other.returns)
+    for seed in SEEDS:
+        leaves = map(jax.tree.leaves, (one.policy(seed).actor, other.policy(seed).actor))
+        for a, b in zip(*leaves, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_an_interrupted_training_goes_on_to_the_same_bits(stopped, whole):
+    _assert_same(_train(stopped), whole)
+
+
+def test_a_finished_training_is_not_repeated(tmp_path, whole, monkeypatch):
+    _train(tmp_path)
+    monkeypatch.setattr(lanes, "_chunk", lambda *_: pytest.fail("trained again"))
+    _assert_same(_train(tmp_path), whole)
+
+
+def test_the_last_two_are_kept(stopped):
+    assert all(len(list(d.glob("step-*"))) <= 2 for d in stopped.iterdir())
+    assert any(len(list(d.glob("step-*"))) == 2 for d in stopped.iterdir())
+
+
+def _newest(directory):
+    lane = next(d for d in sorted(directory.iterdir()) if len(list(d.glob("step-*"))) == 2)
+    return sorted(lane.glob("step-*"))
+
+
+@pytest.mark.parametrize("damage", ["truncated", "flipped", "empty"])
+def test_a_damaged_checkpoint_falls_back_to_the_older_one(stopped, whole, damage):
+    newest = _newest(stopped)[-1]
+    content = bytearray(newest.read_bytes())
+    if damage == "truncated":
+        content = content[: len(content) // 2]
+    elif damage == "flipped":
+        content[-50] ^= 1
+    else:
+        content = bytearray()
+    newest.write_bytes(content)
+    with pytest.warns(UserWarning, match="an older checkpoint is used"):
+        _assert_same(_train(stopped), whole)
+
+
+def test_no_silent_restart_when_every_checkpoint_is_damaged(stopped):
+    for file in _newest(stopped):
+        file.write_bytes(b"")
+    with pytest.raises(rtd.UserError, match="no older checkpoint is left"):
+        _train(stopped)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"gamma": 0.5}, "gamma: 0.99 there, 0.5 here"),
+        ({"algorithm": "lstm-td3"}, "algorithm: h-td3 there, lstm-td3 here"),
+        ({"hidden_size": 8}, "hidden_size: 4 there, 8 here"),
+    ],
+)
+def test_another_configuration_is_refused_with_the_difference(stopped, change, message):
+    with pytest.raises(rtd.UserError, match=message):
+        _train(stopped, dataclasses.replace(CONFIG, **change))
+
+
+def test_another_world_or_version_is_refused(stopped, monkeypatch):
+    with pytest.raises(rtd.UserError, match="another identity .params"):
+        _train(stopped, env=rtd.make("rover", disturbance="ar1-slip-fast"))
+    from rtd3jax.training import checkpoint
+
+    monkeypatch.setattr(checkpoint, "versions", lambda: {"jax": "9.9", "jaxlib": "9.9"})
+    with pytest.raises(rtd.UserError, match="another versions .jax: .* there, 9.9 here"):
+        _train(stopped)
+
+
+def test_a_directory_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(rtd.UserError, match="cannot be written"):
+        _train(tmp_path / "file")
+
+
+def test_typed_keys_survive(tmp_path):
+    from rtd3jax.training.checkpoint import _from_array, _to_array
+
+    key = jax.random.key(3)
+    leaf = jax.eval_shape(lambda: key)
+    back = _from_array(_to_array(key), leaf, "key", tmp_path)
+    assert back.dtype == key.dtype
+    np.testing.assert_array_equal(jax.random.bits(back), jax.random.bits(key))
