@@ -55,6 +55,13 @@ class Config:
     batch_size: int = _field(100, "transitions in an update (LSTM-TD3: 100)", low=1)
     actor_learning_rate: float = _field(1e-3, "Adam's step for the actor", traced=True, low=0)
     critic_learning_rate: float = _field(1e-3, "Adam's step for the critics", traced=True, low=0)
+    final_learning_rate_fraction: float = _field(
+        1.0,
+        "share of both learning rates that is left at the last step; they fall linearly",
+        traced=True,
+        low=0,
+        high=1,
+    )
     gamma: float = _field(0.99, "discount factor", traced=True, low=0, high=1)
     tau: float = _field(
         0.005, "share of the online weights in a target update", traced=True, low=0, high=1

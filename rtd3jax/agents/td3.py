@@ -30,12 +30,22 @@ class Hyperparameters:
 
     actor_learning_rate: jax.Array
     critic_learning_rate: jax.Array
+    final_learning_rate_fraction: jax.Array
     gamma: jax.Array
     tau: jax.Array
     exploration_noise: jax.Array
     target_noise: jax.Array
     target_noise_clip: jax.Array
     history_length: jax.Array
+
+    def at(self, progress: jax.Array) -> "Hyperparameters":
+        """These numbers when the share ``progress`` [] of all steps is done: the rates decay."""
+        scale = 1.0 - (1.0 - self.final_learning_rate_fraction) * progress
+        return dataclasses.replace(
+            self,
+            actor_learning_rate=scale * self.actor_learning_rate,
+            critic_learning_rate=scale * self.critic_learning_rate,
+        )
 
 
 @struct.dataclass

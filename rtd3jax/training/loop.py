@@ -251,6 +251,7 @@ class Program:
         config, variant = self.config, VARIANTS[self.config.algorithm]
         sample_key, target_key = jax.random.split(key)
         updates = step - config.learning_starts + 1
+        numbers = numbers.at(step.astype(jnp.float32) / config.total_steps)
 
         def learn(learner):
             batch = sample(
