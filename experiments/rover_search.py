@@ -29,15 +29,18 @@ BASE = {
     "final_learning_rate_fraction": 1.0,
     "gamma": 0.99,
     "exploration_noise": 0.1,
+    "target_noise": 0.2,
 }
 CHANGES: tuple[dict, ...] = (
     *(
         {"gamma": gamma, "learning_rate": rate}
-        for gamma, rate in itertools.product((0.99, 0.9), (1e-3, 3e-4))
+        for gamma, rate in ((0.99, 1e-3), (0.99, 3e-4), (0.9, 1e-3))
     ),
     {"final_learning_rate_fraction": 0.0},
-    {"final_learning_rate_fraction": 0.0, "gamma": 0.9},
-    {"final_learning_rate_fraction": 0.0, "exploration_noise": 0.2},
+    # Smoothing by 0.2 costs 0.08 a step where the best policy costs 0.006: noise in every target.
+    {"final_learning_rate_fraction": 0.0, "target_noise": 0.02},
+    {"final_learning_rate_fraction": 0.0, "target_noise": 0.02, "gamma": 0.5},
+    {"final_learning_rate_fraction": 0.0, "gamma": 0.0},
 )
 """What each setting changes in `BASE`."""
 

@@ -10,11 +10,13 @@ import dataclasses
 import json
 import os
 import re
+import signal
 import sys
+import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import jax
 import numpy as np
@@ -26,7 +28,7 @@ from rtd3jax.evaluate import evaluate
 from rtd3jax.policy import constant_policy, random_policy
 from rtd3jax.study.lock import parse_shard, writer
 from rtd3jax.study.plan import PRESETS, Cell, Grid, cell_jobs, estimate, lane_bytes, make_cells
-from rtd3jax.study.rundir import Reference, RunDirectory
+from rtd3jax.study.rundir import LOG, Reference, RunDirectory
 from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.lanes import Group, Job, advance_groups, make_groups, workers
 from rtd3jax.training.progress import Progress
@@ -40,8 +42,17 @@ _GRID_FIELDS = ("algorithm", "history_length")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; the exit status: 0 done, 1 lanes were lost, 2 bad input, 130 interrupted."""
-    options = _parser().parse_args(arguments)
+    """Run the command; the exit status.
+
+    0 done, 1 lanes were lost or failed, 2 bad input, 130 interrupted, 143 asked to terminate (as a
+    batch system does before it kills).
+    """
+    try:
+        options = _parser().parse_args(arguments)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    before = _on_termination(_terminate)
     try:
         if options.device:
             jax.config.update("jax_default_device", _device(options.device))
@@ -53,6 +64,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # A full disk, say. What was written before is whole, and the same command goes on from it.
         print(f"error: {error.filename or _out(options)}: {error.strerror}", file=sys.stderr)
         return 2
+    finally:
+        _on_termination(before)
+
+
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM: lanes write their checkpoints, as after Ctrl-C."""
+
+
+def _terminate(*_: Any) -> None:
+    raise _Terminated
+
+
+def _on_termination(handler: Any) -> Any:
+    """Set SIGTERM's handler; the one before. Only the main thread may."""
+    if threading.current_thread() is not threading.main_thread():
+        return None
+    return signal.signal(signal.SIGTERM, handler)
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -90,7 +118,7 @@ def _train(
         print(f"{len(jobs) - len(waiting)} of {len(jobs)} lanes are there already")
     for job in waiting:
         directory.error_path(*job.owner).unlink(missing_ok=True)
-    interrupted = False
+    interrupted = 0
     groups = make_groups(waiting, strategy, len(workers()))
     references = [r for cell in _worlds(directory.cells) for r in _references(cell)]
     recorder = _Recorder(directory, checkpoints, references)
@@ -102,14 +130,14 @@ def _train(
                 recorder.update(group)
 
             advance_groups(groups, on_chunk, checkpoints)
-    except KeyboardInterrupt:
-        interrupted = True
+    except KeyboardInterrupt as interrupt:
+        interrupted = 143 if isinstance(interrupt, _Terminated) else 130
     directory.derive(references)
     print((directory.path / "summary.md").read_text())
     print(f"results: {directory.path}")
     if interrupted:
         print("interrupted: the same command goes on with the lanes that are missing")
-        return 130
+        return interrupted
     for line in recorder.complaints:
         print(line, file=sys.stderr)
     return 1 if recorder.complaints else 0
@@ -126,6 +154,7 @@ class _Recorder:
         self._references = references
         self._derived = time.perf_counter()
         self._logged: dict[int, int] = {}
+        self._there = directory.repair_log()
         self._began = time.perf_counter()
         self.complaints: list[str] = []
 
@@ -150,16 +179,17 @@ class _Recorder:
 
     def _log(self, group: Group) -> None:
         assert group.returns is not None
-        with (self._directory.path / "log.jsonl").open("a") as log:
+        with (self._directory.path / LOG).open("a") as log:
             for index, job in enumerate(group.jobs):
                 cell, seed = job.owner
                 curve, steps = group.returns[index], evaluation_steps(cell.config)
                 reached = int(np.sum(steps <= group.step))
                 for k in range(self._logged.get(id(job), 0), reached):
+                    lane = {**cell.key, "seed": seed, "step": int(steps[k])}
+                    if tuple(lane.values()) in self._there:
+                        continue  # the lane went on from a checkpoint before this evaluation
                     row = {
-                        **cell.key,
-                        "seed": seed,
-                        "step": int(steps[k]),
+                        **lane,
                         "return": _json_number(curve[k]),
                         "seconds": round(time.perf_counter() - self._began, 3),
                     }
@@ -363,9 +393,14 @@ def _memory() -> int:
     return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise UserError(f"{message}; --help lists what there is")
+
+
 def _parser() -> argparse.ArgumentParser:
     worlds = "\n".join(f"  {env}: {', '.join(DISTURBANCES[env])}" for env in ENVIRONMENTS)
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="python -m rtd3jax.sweep",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,

@@ -20,6 +20,7 @@ import numpy as np
 from rtd3jax.errors import UserError
 from rtd3jax.files import read_arrays, write_arrays, write_bytes_atomically
 from rtd3jax.study.figures import final_returns, learning_curves
+from rtd3jax.study.lock import deriver, is_held
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.results import (
     CURVES,
@@ -30,9 +31,12 @@ from rtd3jax.study.results import (
 )
 from rtd3jax.study.summary import summary_markdown
 from rtd3jax.training.checkpoint import checkpoint_steps
+from rtd3jax.training.run import check_seeds
 
 _CURVE_ARRAYS = ("steps", "returns", "true_returns")
 _FINAL_ARRAYS = ("final_returns", "final_true_returns")
+LOG = "log.jsonl"
+_LANE = ("env", "disturbance", "algorithm", "history_length", "seed")
 _PACKAGES = ("rtd3jax", "jax", "jaxlib", "flax", "optax", "gymnax", "numpy")
 
 
@@ -55,7 +59,13 @@ class RunDirectory:
     """
 
     def __init__(
-        self, path: str | Path, cells: Sequence[Cell], seeds: Sequence[int], episodes: int
+        self,
+        path: str | Path,
+        cells: Sequence[Cell],
+        seeds: Sequence[int],
+        episodes: int,
+        *,
+        prepare: bool = True,
     ):
         self.path = Path(path)
         self.cells = list(cells)
@@ -66,19 +76,22 @@ class RunDirectory:
             "seeds": list(seeds),
             "final_episodes": episodes,
         }
-        self._open()
+        if prepare:
+            self._prepare()
 
     @classmethod
     def open(cls, path: str | Path) -> "RunDirectory":
         """The study that is in ``path`` already."""
         study = _read_study(Path(path) / "config.json")
         try:
-            cells = [Cell.from_dict(cell) for cell in study["cells"]]
-            return cls(path, cells, study["seeds"], study["final_episodes"])
-        except (KeyError, TypeError) as error:
+            cells = [Cell.from_dict(dict(cell)) for cell in study["cells"]]
+            seeds, episodes = check_seeds(study["seeds"]), int(study["final_episodes"])
+        except (KeyError, TypeError, ValueError) as error:
             raise UserError(f"{path}/config.json is not a study's configuration") from error
+        return cls(path, cells, seeds, episodes, prepare=False)
 
-    def _open(self) -> None:
+    def _prepare(self) -> None:
+        """Make the directory, or see that it holds this study."""
         config = self.path / "config.json"
         try:
             self.path.mkdir(parents=True, exist_ok=True)
@@ -104,11 +117,18 @@ class RunDirectory:
 
     def lane_path(self, cell: Cell, seed: int) -> Path:
         """Where a lane's file is."""
-        return self.path / "lanes" / cell_name(cell) / f"seed-{seed}.safetensors"
+        return self._within("lanes", cell_name(cell), f"seed-{seed}.safetensors")
 
     def checkpoint_directory(self, cell: Cell, seed: int) -> Path:
         """Where a lane that is under way keeps its checkpoints."""
-        return self.path / "checkpoints" / cell_name(cell) / f"seed-{seed}"
+        return self._within("checkpoints", cell_name(cell), f"seed-{seed}")
+
+    def _within(self, *parts: str) -> Path:
+        """A path inside the directory, also where links lead elsewhere."""
+        path = self.path.joinpath(*parts)
+        if not path.resolve().is_relative_to(self.path.resolve()):
+            raise UserError(f"{path} leads outside {self.path}; remove the link")
+        return path
 
     def error_path(self, cell: Cell, seed: int) -> Path:
         """Where the reason stands for which a lane could not be trained."""
@@ -145,15 +165,34 @@ class RunDirectory:
         """Keep the reason for which a lane could not be trained."""
         write_bytes_atomically(self.error_path(cell, seed), (reason + "\n").encode())
 
+    def repair_log(self) -> set[tuple[Any, ...]]:
+        """End a line that was cut short; the lanes and steps that the log has."""
+        log = self.path / LOG
+        if log.exists() and not log.read_bytes().endswith(b"\n"):
+            with log.open("a") as file:
+                file.write("\n")
+        return {(*_lane_of(row), row["step"]) for row in read_log(log)}
+
     def ledger(self) -> list[dict[str, Any]]:
-        """Each lane's state: done, lost, failed, under way (at a step), or planned."""
+        """Each lane's state: done, lost, failed, running, interrupted (at a step), or planned.
+
+        Nothing is kept for it: it is read from the lanes' files, the log and the lock, so that it
+        cannot disagree with them.
+        """
+        begun = "running" if is_held(self.path) else "interrupted"
+        logged: dict[Any, int] = {}
+        for row in read_log(self.path / LOG):
+            lane = _lane_of(row)
+            logged[lane] = max(row["step"], logged.get(lane, 0))
         return [
-            {**cell.key, "seed": seed, **self._lane_status(cell, seed)}
+            {**cell.key, "seed": seed, **self._lane_status(cell, seed, begun, logged)}
             for cell in self.cells
             for seed in self.seeds
         ]
 
-    def _lane_status(self, cell: Cell, seed: int) -> dict[str, Any]:
+    def _lane_status(
+        self, cell: Cell, seed: int, begun: str, logged: dict[Any, int]
+    ) -> dict[str, Any]:
         if self.is_done(cell, seed):
             failure = read_arrays(self.lane_path(cell, seed))[1]["failure"]
             if failure is not None:
@@ -163,11 +202,20 @@ class RunDirectory:
             reason = self.error_path(cell, seed).read_text().strip()
             return {"status": "failed", "step": 0, "reason": reason}
         steps = checkpoint_steps(self.checkpoint_directory(cell, seed))
-        status = "under way" if steps else "planned"
-        return {"status": status, "step": max(steps, default=0), "reason": ""}
+        kept = max(steps, default=0)
+        reached = logged.get(_lane_of({**cell.key, "seed": seed}), 0)
+        # A lane that is logged to its end but has no file was removed, to be trained again.
+        reached = max(kept, reached if reached < cell.config.total_steps else 0)
+        reason = f"next start at step {kept:,}" if reached and begun != "running" else ""
+        return {"status": begun if reached else "planned", "step": reached, "reason": reason}
 
     def derive(self, references: Iterable[Reference], *, pictures: bool = True) -> None:
         """Write tables, pictures and the summary of the lanes there are."""
+        # Shards that end together: the last to come here sees the lanes of all.
+        with deriver(self.path):
+            self._derive(references, pictures)
+
+    def _derive(self, references: Iterable[Reference], pictures: bool) -> None:
         curves: list[dict[str, Any]] = []
         episodes: list[dict[str, Any]] = []
         failures: list[dict[str, Any]] = []
@@ -233,6 +281,23 @@ def _read_study(config: Path) -> Any:
         raise UserError(f"there is no study in {config.parent} ({error.strerror})") from error
     except (ValueError, KeyError, TypeError) as error:
         raise UserError(f"{config} is not a study's configuration") from error
+
+
+def read_log(path: Path) -> list[dict[str, Any]]:
+    """Rows of a log; a line that a killed process left half-written is passed over."""
+    rows = []
+    for line in path.read_text().splitlines() if path.exists() else ():
+        try:
+            row = json.loads(line)
+            if isinstance(row["step"], int) and _lane_of(row):
+                rows.append(row)
+        except (ValueError, KeyError, TypeError):
+            continue
+    return rows
+
+
+def _lane_of(row: dict[str, Any]) -> tuple[Any, ...]:
+    return tuple(row[name] for name in _LANE)
 
 
 def cell_name(cell: Cell) -> str:

@@ -147,7 +147,14 @@ class Checkpoints:
 
 def versions() -> dict[str, str]:
     """Versions on which a lane's bits depend."""
-    return {name: importlib.metadata.version(name) for name in ("jax", "jaxlib")}
+    return {name: _version(name) for name in ("rtd3jax", "jax", "jaxlib")}
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:  # run from a source tree
+        return "not installed"
 
 
 def checkpoint_steps(directory: Path) -> list[int]:

@@ -20,6 +20,7 @@ def _numbers(**changes):
     numbers = dict(
         actor_learning_rate=1e-2,
         critic_learning_rate=2e-2,
+        final_learning_rate_fraction=0.25,
         gamma=0.9,
         tau=0.1,
         exploration_noise=0.1,
@@ -159,3 +160,12 @@ def test_exploration_is_relative_to_half_the_range_and_stays_within():
     assert float(jnp.std(noisy)) == pytest.approx(0.3, rel=0.02)
     wild = td3.explore(jax.random.key(0), action, jnp.float32(10.0), BOUNDS)
     assert float(wild.min()) == -2.0 and float(wild.max()) == 4.0
+
+
+def test_learning_rates_fall_linearly_to_their_final_fraction():
+    numbers = _numbers()
+    for progress, share in ((0.0, 1.0), (0.5, 0.625), (1.0, 0.25)):
+        now = numbers.at(jnp.float32(progress))
+        np.testing.assert_allclose(now.actor_learning_rate, 1e-2 * share, rtol=1e-6)
+        np.testing.assert_allclose(now.critic_learning_rate, 2e-2 * share, rtol=1e-6)
+    assert float(now.gamma) == float(numbers.gamma)

@@ -3,6 +3,8 @@
 import importlib.util
 import pathlib
 
+import pytest
+
 EXPERIMENTS = pathlib.Path(__file__).parents[2] / "experiments"
 
 
@@ -17,10 +19,13 @@ def test_killed_sweeps_resume_to_the_same_bits():
     assert load(EXPERIMENTS / "reliability" / "kill_and_resume.py").main(["--quick"]) == 0
 
 
-def test_the_search_runs(tmp_path, monkeypatch):
+def test_the_search_runs_and_keeps_its_rows(tmp_path, monkeypatch):
     search = load(EXPERIMENTS / "rover_search.py")
-    monkeypatch.setattr(
-        search, "GRID", {"gamma": (0.9,), "learning_rate": (1e-3,), "exploration_noise": (0.1,)}
-    )
-    search.main(["--quick"], tmp_path / "search.csv")
-    assert len((tmp_path / "search.csv").read_text().splitlines()) == 2
+    monkeypatch.setattr(search, "CHANGES", ({"gamma": 0.5},))
+    out = tmp_path / "search.csv"
+    search.main(["--quick", "--out", str(out)])
+    rows = out.read_text().splitlines()
+    assert len(rows) == 2
+    monkeypatch.setattr(search, "search", lambda *_: pytest.fail("searched again"))
+    search.main(["--quick", "--out", str(out)])
+    assert out.read_text().splitlines() == rows

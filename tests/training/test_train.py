@@ -70,7 +70,23 @@ def test_vmap_agrees_with_map():
 
 
 def test_a_lost_lane_is_reported_and_does_not_touch_the_others():
-    lost = _train(critic_learning_rate=1e30, seeds=[0])
+    from rtd3jax.training.lanes import advance_groups, make_groups
+    from rtd3jax.training.run import make_jobs
+
+    # A broken configuration and a sound one share a program, and stand side by side.
+    broken = dataclasses.replace(TINY, algorithm="td3", critic_learning_rate=1e30)
+    sound = dataclasses.replace(TINY, algorithm="td3")
+    jobs = [*make_jobs(_rover(), broken, [0]), *make_jobs(_rover(), sound, [3])]
+    for strategy in ("map", "vmap"):
+        groups = make_groups(jobs, strategy, 1)
+        advance_groups(groups, lambda group: None)
+        (_, one), (_, other) = (pair for group in groups for pair in group.lanes())
+        assert int(one.failure) != 0 and int(other.failure) == 0
+        if strategy == "map":
+            assert _same(other.learner.actor, _train("td3", seeds=[3]).policy(3).actor)
+        assert np.all(np.isfinite(other.returns))
+
+    lost = _train("td3", critic_learning_rate=1e30, seeds=[0])
     assert np.isnan(lost.returns[0, -1])
     assert "loss is not finite" in lost.failures[0].reason
     with pytest.raises(rtd.UserError, match="seed 0 was lost"):

@@ -1,0 +1,279 @@
+"""What ends a sweep, and what is found afterwards."""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+
+from rtd3jax import sweep
+from rtd3jax.study.rundir import LOG, RunDirectory, read_log
+
+STUDY = [
+    *("--env", "rover", "--disturbances", "ar1-slip", "--algorithms", "td3", "h-td3"),
+    *("--history-lengths", "2", "--seeds", "2", "--total-steps", "400", "--hidden-size", "4"),
+    *("--batch-size", "4", "--learning-starts", "10", "--eval-every", "100"),
+    *("--eval-episodes", "1", "--final-episodes", "2", "--quiet"),
+]
+TABLES = "curves.parquet", "episodes.parquet", "summary.md"
+
+
+@pytest.fixture(autouse=True)
+def few_reference_episodes(monkeypatch):
+    monkeypatch.setattr(sweep, "REFERENCE_EPISODES", 2)
+
+
+def run(out, *more):
+    return sweep.main([*STUDY, "--out", str(out), *more])
+
+
+def contents(out):
+    files = [out / name for name in TABLES] + sorted(out.glob("lanes/**/*.safetensors"))
+    return {str(file.relative_to(out)): file.read_bytes() for file in files}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sweep, "REFERENCE_EPISODES", 2)
+        out = tmp_path_factory.mktemp("whole") / "run"
+        assert run(out) == 0
+    return out
+
+
+def cached(whole):
+    """The environment of processes that share their compilations."""
+    return {
+        **os.environ,
+        "JAX_COMPILATION_CACHE_DIR": str(whole.parent / "cache"),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    }
+
+
+@contextlib.contextmanager
+def one_step_chunks(monkeypatch):
+    from rtd3jax.training import lanes
+
+    with monkeypatch.context() as patch:
+        patch.setattr(lanes, "_FIRST_CHUNK", 40)
+        patch.setattr(lanes, "CHUNK_SECONDS", 0.0)
+        yield patch
+
+
+# A process that dies, as from SIGKILL, when it is about to move the file of this name.
+DYING = """
+import os, signal, sys
+from rtd3jax import files, sweep
+from rtd3jax.training import lanes
+
+sweep.REFERENCE_EPISODES = 2
+lanes._FIRST_CHUNK, lanes.CHUNK_SECONDS = 40, 0.0
+part, times = sys.argv[1], int(sys.argv[2])
+real = os.replace
+
+def replace(source, target):
+    global times
+    if part in str(target):
+        times -= 1
+        if times == 0:
+            with open(source, "r+b") as file:
+                file.truncate(os.path.getsize(source) // 2)
+            os.kill(os.getpid(), signal.SIGKILL)
+    real(source, target)
+
+files.os.replace = replace
+sys.exit(sweep.main(sys.argv[3:]))
+"""
+
+
+@pytest.mark.parametrize(
+    ("part", "times"), [("step-", 30), ("seed-1.safetensors", 1), ("episodes.parquet", 1)]
+)
+def test_killed_while_it_writes(part, times, whole, tmp_path):
+    out = tmp_path / "run"
+    arguments = [*STUDY, "--out", str(out), "--checkpoint-every", "20steps"]
+    dying = subprocess.run(
+        [sys.executable, "-c", DYING, part, str(times), *arguments],
+        env=cached(whole),
+        capture_output=True,
+    )
+    assert dying.returncode == -signal.SIGKILL, dying.stderr.decode()[-2000:]
+    assert list(out.rglob(".*.tmp"))
+    assert not (out / "summary.md").exists()
+    assert run(out) == 0
+    assert contents(out) == contents(whole)
+    assert not list(out.rglob("checkpoints/**/*.tmp"))
+
+
+def test_sigterm_leaves_checkpoints_and_the_rest_is_the_same(whole, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "run"
+    real = sweep._Recorder.update
+
+    def update(self, group):
+        real(self, group)
+        if group.step >= 40:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    with one_step_chunks(monkeypatch) as patch:
+        patch.setattr(sweep._Recorder, "update", update)
+        assert run(out) == 143
+    assert "the same command goes on" in capsys.readouterr().out
+    assert list(out.rglob("step-*.safetensors"))
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+    assert sweep.main(["--out", str(out), "--status"]) == 0
+    status = capsys.readouterr().out
+    assert "interrupted" in status and "next start at step" in status and "planned" in status
+    assert run(out) == 0
+    assert contents(out) == contents(whole)
+
+
+def test_one_worker_finishes_what_two_began(whole, tmp_path, monkeypatch):
+    out = tmp_path / "run"
+
+    def interrupt(self, group):
+        raise KeyboardInterrupt
+
+    with one_step_chunks(monkeypatch) as patch:
+        patch.setattr(sweep._Recorder, "update", interrupt)
+        assert run(out) == 130
+    from rtd3jax.training import lanes
+
+    one = lanes.workers()[:1]
+    monkeypatch.setattr(lanes, "workers", lambda: one)
+    assert run(out) == 0
+    assert contents(out) == contents(whole)
+
+
+def test_the_log_has_each_evaluation_once_however_often_it_was_cut(whole, tmp_path, monkeypatch):
+    out = tmp_path / "run"
+    calls = []
+    real = sweep._Recorder.update
+
+    def update(self, group):
+        real(self, group)
+        calls.append(1)
+        if len(calls) % 20 == 0:
+            raise KeyboardInterrupt
+
+    with one_step_chunks(monkeypatch) as patch:
+        patch.setattr(sweep._Recorder, "update", update)
+        assert run(out) == 130
+        with (out / LOG).open("a") as log:
+            log.write('{"env": "rover", "disturb')  # a line that SIGKILL cut short
+        assert run(out) in (0, 130)
+    assert run(out) == 0
+    log = [line for line in (out / LOG).read_text().splitlines() if line.endswith("}")]
+    keys = [tuple(list(json.loads(line).values())[:6]) for line in log]
+    assert len(keys) == len(set(keys)) == 2 * 2 * 4
+    assert len(read_log(out / LOG)) == len(keys)
+
+
+def test_two_processes_with_a_shard_each_merge_to_the_same_tables(whole, tmp_path):
+    out = tmp_path / "run"
+    script = "import sys; from rtd3jax import sweep; sweep.REFERENCE_EPISODES = 2; "
+    script += "sys.exit(sweep.main(sys.argv[1:]))"
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", script, *STUDY, "--out", str(out), "--shard", f"{i}/2"],
+            env=cached(whole),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+        )
+        for i in (1, 2)
+    ]
+    for process in processes:
+        _, errors = process.communicate()
+        assert process.returncode == 0, errors.decode()[-2000:]
+    assert contents(out) == contents(whole)
+
+
+def test_tables_wait_for_another_shards_tables(whole):
+    from rtd3jax.study.lock import deriver
+
+    directory = RunDirectory.open(whole)
+    with deriver(whole):
+        thread = threading.Thread(target=directory.derive, args=([],), kwargs={"pictures": False})
+        thread.start()
+        time.sleep(0.3)
+        assert thread.is_alive()
+    before = contents(whole)
+    thread.join()
+    assert len(contents(whole)) == len(before)
+    # Put back what the other tests compare with.
+    for name, content in before.items():
+        (whole / name).write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seeds": ["../../../outside"]}, "not a study's configuration"),
+        ({"seeds": [-1]}, "not a study's configuration"),
+        ({"final_episodes": "many"}, "not a study's configuration"),
+        ({"cells": [{"env": "../..", "disturbance": "../../x"}]}, None),
+        ({"cells": [{"env": "rover", "disturbance": "none", "import": "os"}]}, "not a study's"),
+        ({"cells": "rover"}, "not a study's configuration"),
+    ],
+)
+def test_a_hostile_configuration_is_read_without_leaving_the_directory(
+    change, message, tmp_path, capsys
+):
+    out = tmp_path / "in" / "run"
+    out.mkdir(parents=True)
+    study = {
+        "cells": [{"env": "rover", "disturbance": "none"}],
+        "seeds": [0],
+        "final_episodes": 1,
+        **change,
+    }
+    (out / "config.json").write_text(json.dumps({"study": study}))
+    before = sorted(tmp_path.rglob("*"))
+    status = sweep.main(["--out", str(out), "--status"])
+    error = capsys.readouterr().err
+    if message is None:
+        assert status == 0 and not error
+    else:
+        assert status == 2 and message in error and error.count("\n") == 1
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_links_that_lead_outside_are_refused(tmp_path, capsys):
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (outside / "step-000000001.safetensors").write_text("mine")
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / "checkpoints").symlink_to(outside)
+    assert run(out) == 2
+    assert "holds no study" in capsys.readouterr().err
+    (out / "checkpoints").unlink()
+    assert run(out, "--total-steps", "11", "--eval-every", "11") == 0
+    for file in out.glob("lanes/**/*.safetensors"):
+        file.unlink()
+    (out / "checkpoints").symlink_to(outside)
+    assert run(out, "--total-steps", "11", "--eval-every", "11") != 0
+    assert "leads outside" in capsys.readouterr().err
+    assert (outside / "step-000000001.safetensors").read_text() == "mine"
+
+
+def test_a_directory_that_cannot_be_written_is_one_line(tmp_path, capsys, monkeypatch):
+    import errno
+
+    from rtd3jax.study import lock
+
+    real = os.open
+
+    def read_only(path, flags, *rest):
+        if flags & os.O_CREAT:
+            raise OSError(errno.EROFS, "Read-only file system", str(path))
+        return real(path, flags, *rest)
+
+    monkeypatch.setattr(lock.os, "open", read_only)
+    assert run(tmp_path / "run") == 2
+    error = capsys.readouterr().err
+    assert "Read-only file system" in error and error.count("\n") == 1
