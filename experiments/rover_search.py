@@ -9,7 +9,6 @@ A setting whose row is there already is not trained again.
 """
 
 import argparse
-import itertools
 import pathlib
 import time
 
@@ -41,6 +40,9 @@ CHANGES: tuple[dict, ...] = (
     {"final_learning_rate_fraction": 0.0, "target_noise": 0.02},
     {"final_learning_rate_fraction": 0.0, "target_noise": 0.02, "gamma": 0.5},
     {"final_learning_rate_fraction": 0.0, "gamma": 0.0},
+    {"final_learning_rate_fraction": 0.0, "gamma": 0.0, "learning_rate": 3e-3},
+    {"final_learning_rate_fraction": 0.0, "gamma": 0.0, "exploration_noise": 0.2},
+    {"final_learning_rate_fraction": 0.0, "gamma": 0.0, "total_steps": 60_000},
 )
 """What each setting changes in `BASE`."""
 

@@ -8,6 +8,7 @@ import argparse
 import collections
 import dataclasses
 import json
+import math
 import os
 import re
 import signal
@@ -87,8 +88,8 @@ def _run(options: argparse.Namespace) -> int:
     if options.status:
         return _status(_out(options))
     cells = make_cells(_grids(options), _overrides(options))
-    seeds = list(range(_positive("seeds", options.seeds)))
-    episodes = _positive("final_episodes", options.final_episodes)
+    seeds = list(range(_count("seeds", options.seeds)))
+    episodes = _count("final_episodes", options.final_episodes)
     strategy = check_strategy(options.strategy)
     jobs = cell_jobs(cells, seeds, strategy)
     if options.dry_run:
@@ -236,12 +237,14 @@ def _checkpoints(directory: RunDirectory, every: str) -> Checkpoints:
 
 
 def _parse_interval(text: str) -> tuple[float | None, int | None]:
-    """``"300s"``, ``"5m"`` or ``"2000steps"`` as (seconds, None) or (None, steps)."""
+    """``"300s"``, ``"5m"`` or ``"2000steps"`` as (seconds, None) or (infinity, steps)."""
+    if text == "auto":
+        return None, None
     match = re.fullmatch(r"(\d{1,9})\s*(s|m|h|steps)?", text.strip())
     if match is None or int(match[1]) < 1:
         raise UserError(f"--checkpoint-every {text!r} is not like 300s, 5m, 1h or 2000steps")
     if match[2] == "steps":
-        return None, int(match[1])
+        return math.inf, int(match[1])
     return float(match[1]) * {"m": 60, "h": 3600}.get(match[2], 1), None
 
 
@@ -363,9 +366,9 @@ def _out(options: argparse.Namespace) -> Path:
     return Path(options.out or Path("runs") / (options.preset or options.env))
 
 
-def _positive(name: str, value: int) -> int:
-    if value < 1:
-        raise UserError(f"{name} must be at least 1, not {value}")
+def _count(name: str, value: int, most: int = 100_000) -> int:
+    if not 1 <= value <= most:
+        raise UserError(f"{name} must be from 1 to {most:,}, not {value}")
     return value
 
 
@@ -428,7 +431,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     work.add_argument("--shard", metavar="I/N", help="this process takes the I-th of N shares")
     work.add_argument(
-        "--checkpoint-every", default="5m", metavar="T", help="300s, 5m, 1h or 2000steps [5m]"
+        "--checkpoint-every",
+        default="auto",
+        metavar="T",
+        help="300s, 5m, 1h or 2000steps [five minutes, or longer where it would cost above 2%%]",
     )
     work.add_argument("--dry-run", action="store_true", help="print the plan and its cost")
     work.add_argument("--quiet", action="store_true", help="no progress bar")

@@ -96,7 +96,7 @@ def test_a_lost_lane_is_reported_and_the_exit_status_says_so(tmp_path, capsys):
         ("--env rover --disturbances ar1-slipp", "ar1-slip"),
         ("--env rover --algorithms h-td", "did you mean 'h-td3'"),
         ("--env CartPole-v1", "action"),
-        ("--preset quick --seeds 0", "seeds must be at least 1"),
+        ("--preset quick --seeds 0", "seeds must be from 1"),
         ("--preset quick --total-steps -1", "total_steps must be at least 1"),
         ("--preset quick --batch-size 5000", "batch_size"),
         ("--env pendulum --disturbances noise:sigma=-1", "sigma"),

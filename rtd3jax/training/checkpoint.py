@@ -23,7 +23,11 @@ from rtd3jax.files import read_arrays, write_arrays
 from rtd3jax.training.loop import Lane, LaneState, Program
 
 DEFAULT_SECONDS = 300.0
-"""Between checkpoints of a lane. A checkpoint takes well below a second."""
+"""Between checkpoints of a lane, unless they are so large that they take their time."""
+
+_PATIENCE = 150
+"""A checkpoint waits by default for this many times what the last one took: with five lanes on two
+cores they cost 2% at most, however large the replay."""
 
 KEPT = 2
 _FORMAT = 1
@@ -35,7 +39,8 @@ class Checkpoints:
     Args:
         directory_of: a lane's own directory.
         identity_of: what the lane is, JSON-ready; a checkpoint of something else is refused.
-        seconds: between checkpoints of a lane; None for none by time.
+        seconds: between checkpoints of a lane; None for `DEFAULT_SECONDS`, or longer where a
+            checkpoint takes long; infinity for none by time.
         steps: between checkpoints of a lane; None for none by steps.
     """
 
@@ -43,7 +48,7 @@ class Checkpoints:
         self,
         directory_of: Callable[[Any], Path],
         identity_of: Callable[[Any], dict[str, Any]],
-        seconds: float | None = DEFAULT_SECONDS,
+        seconds: float | None = None,
         steps: int | None = None,
     ):
         self._directory_of = directory_of
@@ -51,16 +56,21 @@ class Checkpoints:
         self._seconds = seconds
         self._steps = steps
         self._written: dict[int, tuple[float, int]] = {}
+        self._cost: dict[int, float] = {}
 
     def is_due(self, group: Any) -> bool:
         """Whether the group's last checkpoint, or its start, is long enough ago."""
         now = time.monotonic()
         when, step = self._written.setdefault(id(group), (now, 0))
-        by_time = self._seconds is not None and now - when >= self._seconds
+        seconds = self._seconds
+        if seconds is None:
+            seconds = max(DEFAULT_SECONDS, _PATIENCE * self._cost.get(id(group), 0.0))
+        by_time = now - when >= seconds
         return by_time or (self._steps is not None and group.step - step >= self._steps)
 
     def save(self, jobs: Iterable[tuple[Any, LaneState]], group: Any, step: int) -> None:
         """Write a checkpoint of each lane at ``step``, then drop those before the last two."""
+        began = time.monotonic()
         for job, state in jobs:
             directory = self._directory_of(job)
             about = {
@@ -79,7 +89,9 @@ class Checkpoints:
                 ) from error
             for old in [*_files(directory)[KEPT:], *_unfinished(directory)]:
                 old.unlink(missing_ok=True)
-        self._written[id(group)] = (time.monotonic(), step)
+        now = time.monotonic()
+        self._written[id(group)] = (now, step)
+        self._cost[id(group)] = now - began
 
     def restore(self, jobs: list[Any]) -> tuple[list[LaneState], int] | None:
         """The newest step at which all these lanes have a sound checkpoint; None for a new start.

@@ -12,7 +12,7 @@ from rtd3jax.config import Config
 from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
 from rtd3jax.policy import Policy
-from rtd3jax.training.checkpoint import DEFAULT_SECONDS, Checkpoints
+from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.lanes import (
     Group,
     Job,
@@ -92,7 +92,7 @@ def train(
     progress: bool = True,
     strategy: str | None = None,
     checkpoint_dir: str | Path | None = None,
-    checkpoint_seconds: float = DEFAULT_SECONDS,
+    checkpoint_seconds: float | None = None,
 ) -> Run:
     """Train one lane per seed.
 
@@ -104,7 +104,8 @@ def train(
         progress: whether to show a bar.
         checkpoint_dir: where lanes keep checkpoints. The same call again goes on from them, to the
             bit; seeds that were finished are not trained again.
-        checkpoint_seconds: between two checkpoints of a lane.
+        checkpoint_seconds: between two checkpoints of a lane; five minutes by default, or longer
+            where they would cost more than 2%.
         strategy: ``map`` (lanes one by one, each on one core) or ``vmap`` (side by side); by
             default what suits the backend.
 
@@ -127,7 +128,7 @@ def train(
     return collect(config, seeds, groups)
 
 
-def _checkpoints(directory: Path, config: Config, env: Any, seconds: float) -> Checkpoints:
+def _checkpoints(directory: Path, config: Config, env: Any, seconds: float | None) -> Checkpoints:
     world = {"env": str(getattr(env, "name", type(env).__name__)), "params": None}
 
     def identity(job: Job) -> dict[str, Any]:

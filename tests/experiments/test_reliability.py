@@ -15,6 +15,16 @@ def load(path):
     return module
 
 
+def test_random_configurations_and_command_lines(capsys):
+    assert load(EXPERIMENTS / "reliability" / "fuzz.py").main(["--quick"]) == 0
+    assert "command lines run" in capsys.readouterr().out
+
+
+def test_the_cost_of_checkpoints(capsys):
+    load(EXPERIMENTS / "reliability" / "overhead.py").main(["--quick"])
+    assert capsys.readouterr().out.count("%") == 3
+
+
 def test_killed_sweeps_resume_to_the_same_bits():
     assert load(EXPERIMENTS / "reliability" / "kill_and_resume.py").main(["--quick"]) == 0
 

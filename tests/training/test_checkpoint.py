@@ -126,7 +126,8 @@ def test_another_world_or_version_is_refused(stopped, monkeypatch):
         _train(stopped, env=rtd.make("rover", disturbance="ar1-slip-fast"))
     from rtd3jax.training import checkpoint
 
-    monkeypatch.setattr(checkpoint, "versions", lambda: {"jax": "9.9", "jaxlib": "9.9"})
+    versions = checkpoint.versions()
+    monkeypatch.setattr(checkpoint, "versions", lambda: {**versions, "jax": "9.9"})
     with pytest.raises(rtd.UserError, match="another versions .jax: .* there, 9.9 here"):
         _train(stopped)
 
@@ -145,3 +146,24 @@ def test_typed_keys_survive(tmp_path):
     back = _from_array(_to_array(key), leaf, "key", tmp_path)
     assert back.dtype == key.dtype
     np.testing.assert_array_equal(jax.random.bits(back), jax.random.bits(key))
+
+
+def test_large_checkpoints_wait_longer_by_default(tmp_path, monkeypatch):
+    from rtd3jax.training import checkpoint
+
+    now = [0.0]
+    monkeypatch.setattr(checkpoint.time, "monotonic", lambda: now[0])
+    group = type("Group", (), {"step": 0})()
+
+    def slow_write(*_):
+        now[0] += 6.0
+
+    monkeypatch.setattr(checkpoint, "write_arrays", slow_write)
+    for seconds, wait in ((None, 900.0), (60.0, 60.0)):
+        checkpoints = checkpoint.Checkpoints(lambda job: tmp_path, lambda job: {}, seconds)
+        assert not checkpoints.is_due(group)
+        checkpoints.save([(None, {"leaf": np.zeros(1)})], group, 1)
+        now[0] += wait - 1.0
+        assert not checkpoints.is_due(group)
+        now[0] += 1.0
+        assert checkpoints.is_due(group)
