@@ -29,6 +29,7 @@ BASE = {
     "gamma": 0.99,
     "exploration_noise": 0.1,
     "target_noise": 0.2,
+    "precision": "float32",
 }
 CHANGES: tuple[dict, ...] = (
     *(
@@ -42,7 +43,21 @@ CHANGES: tuple[dict, ...] = (
     {"final_learning_rate_fraction": 0.0, "gamma": 0.0},
     {"final_learning_rate_fraction": 0.0, "gamma": 0.0, "learning_rate": 3e-3},
     {"final_learning_rate_fraction": 0.0, "gamma": 0.0, "exploration_noise": 0.2},
-    {"final_learning_rate_fraction": 0.0, "gamma": 0.0, "total_steps": 60_000},
+    {
+        "final_learning_rate_fraction": 0.0,
+        "gamma": 0.0,
+        "learning_rate": 3e-3,
+        "exploration_noise": 0.05,
+        "precision": "bfloat16",
+    },
+    {
+        "final_learning_rate_fraction": 0.0,
+        "gamma": 0.0,
+        "learning_rate": 3e-3,
+        "exploration_noise": 0.05,
+        "precision": "bfloat16",
+        "train_on": "sine-slip",
+    },
 )
 """What each setting changes in `BASE`."""
 

@@ -22,6 +22,8 @@ ALGORITHMS = (
 )
 """The six agents of the paper; ``rtd3jax.agents.variants`` says what each reads."""
 
+PRECISIONS = ("float32", "bfloat16")
+
 DEFAULT_HISTORY_LENGTH = 10
 
 
@@ -82,6 +84,13 @@ class Config:
     replay_capacity: int | None = _field(
         None, "transitions kept; the oldest leave first [total_steps]", low=1
     )
+    precision: str = dataclasses.field(
+        default="float32",
+        metadata={
+            "help": "of the factors of wide products in updates: float32, bfloat16",
+            "traced": False,
+        },
+    )
     eval_every: int = _field(1_000, "environment steps between evaluations", low=1)
     eval_episodes: int = _field(10, "episodes of an evaluation", low=1)
 
@@ -90,6 +99,11 @@ class Config:
             raise UserError(
                 f"algorithm {self.algorithm!r} is unknown{nearest(str(self.algorithm), ALGORITHMS)}"
                 f"; the algorithms are {', '.join(ALGORITHMS)}"
+            )
+        if self.precision not in PRECISIONS:
+            raise UserError(
+                f"precision {self.precision!r} is unknown{nearest(str(self.precision), PRECISIONS)}"
+                f"; there are {' and '.join(PRECISIONS)}"
             )
         self._resolve_history_length()
         for field in dataclasses.fields(self):

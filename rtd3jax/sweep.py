@@ -446,10 +446,11 @@ def _parser() -> argparse.ArgumentParser:
     for field in dataclasses.fields(Config):
         if field.name not in _GRID_FIELDS:
             default = "" if field.default is None else f" [{field.default}]"
+            kind = {"str": str, "float": float}.get(str(getattr(field.type, "__name__", "")), int)
             config.add_argument(
                 "--" + field.name.replace("_", "-"),
-                type=int if "int" in str(field.type) else float,
-                metavar="N",
+                type=kind,
+                metavar="NAME" if kind is str else "N",
                 help=field.metadata["help"].replace("%", "%%") + default,
             )
     return parser
