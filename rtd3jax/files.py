@@ -57,7 +57,9 @@ def write_new(path: str | os.PathLike, data: bytes, overwrite: bool = False) -> 
     try:
         write_bytes_atomically(path, data)
     except OSError as error:
-        raise UserError(f"{path} cannot be written: {error.strerror}") from error
+        raise UserError(
+            f"{path} cannot be written ({error.filename or path}: {error.strerror})"
+        ) from error
 
 
 def write_arrays(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], about: Any) -> None:

@@ -2,13 +2,15 @@
 
 import os
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rtd3jax.errors import UserError
 from rtd3jax.policy import Policy
 from rtd3jax.saved import read_policy
-from rtd3jax.study.plan import Cell
-from rtd3jax.study.rundir import RunDirectory
+
+if TYPE_CHECKING:
+    from rtd3jax.study.plan import Cell
+    from rtd3jax.study.rundir import RunDirectory
 
 
 def load_policy(
@@ -49,6 +51,9 @@ def load_policy(
                 f"{path} is not a run directory, among whose lanes {', '.join(given)} would choose"
             )
         return read_policy(path)
+    # Here, because it brings the libraries for tables and pictures, which playing does not need.
+    from rtd3jax.study.rundir import RunDirectory
+
     directory = RunDirectory.open(Path(path))
     seed = given.pop("seed", 0)
     cell = _choose(directory, given)
@@ -57,7 +62,7 @@ def load_policy(
     return directory.policy(cell, seed)
 
 
-def _choose(directory: RunDirectory, wanted: dict[str, Any]) -> Cell:
+def _choose(directory: "RunDirectory", wanted: dict[str, Any]) -> "Cell":
     """The one cell that is as ``wanted``."""
     cells = directory.cells
     for name, value in wanted.items():
@@ -80,6 +85,6 @@ def _choose(directory: RunDirectory, wanted: dict[str, Any]) -> Cell:
     return cells[0]
 
 
-def _values(cells: list[Cell], name: str) -> list[Any]:
+def _values(cells: "list[Cell]", name: str) -> list[Any]:
     """What ``name`` is in these cells."""
     return list(dict.fromkeys(cell.key[name] for cell in cells))

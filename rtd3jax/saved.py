@@ -108,8 +108,8 @@ def _header(path: str | os.PathLike, about: dict[str, Any]) -> tuple[Interface, 
     if algorithm not in ALGORITHMS:
         raise UserError(f"{wrong} algorithm is {algorithm!r}, not one of {', '.join(ALGORITHMS)}")
     lowest = {"observation_size": 1, "hidden_size": 1, "history_length": algorithm != "td3"}
-    for name, low in lowest.items():
-        if not _is_count(about.get(name), int(low)):
+    for name, least in lowest.items():
+        if not _is_count(about.get(name), int(least)):
             raise UserError(f"{wrong} {name} is {about.get(name)!r}")
     shape = about.get("action_shape")
     if not isinstance(shape, list) or not all(_is_count(n, 1) for n in shape):

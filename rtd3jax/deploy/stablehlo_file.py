@@ -3,7 +3,9 @@
 The file is a safetensors file with one array of bytes, ``program``, and the policy's header.
 """
 
+import contextlib
 import os
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -25,7 +27,12 @@ State = dict[str, jax.Array]
 
 
 def stablehlo_bytes(model: Model) -> bytes:
-    """The file of ``(state, observation [B, O]) -> (action [B, *action_shape], state)``."""
+    """The file of ``(state, observation [B, O]) -> (action [B, *action_shape], state)``.
+
+    Raises:
+        UserError: when the package flatbuffers is missing.
+    """
+    _require_flatbuffers()
     arrays = {name: jnp.asarray(array) for name, array in model.arrays.items()}
     (batch,) = jax.export.symbolic_shape("batch")
 
@@ -37,11 +44,12 @@ def stablehlo_bytes(model: Model) -> bytes:
         with jax.default_matmul_precision("highest"):
             return play(model, arrays, state, observation)
 
-    exported = jax.export.export(jax.jit(policy_step), platforms=PLATFORMS)(
-        {name: spec(shape) for name, shape in model.state_shapes.items()},
-        spec((model.observation_size,)),
-    )
-    program = np.frombuffer(bytes(exported.serialize()), np.uint8)
+    with _no_source_locations():
+        exported = jax.export.export(jax.jit(policy_step), platforms=PLATFORMS)(
+            {name: spec(shape) for name, shape in model.state_shapes.items()},
+            spec((model.observation_size,)),
+        )
+        program = np.frombuffer(bytes(exported.serialize()), np.uint8)
     header = {**model.header(), "kind": _KIND, "format": FORMAT}
     return array_bytes({"program": program}, header)
 
@@ -89,6 +97,27 @@ def play(
     return action, {name: following[name] for name in model.state_shapes}
 
 
+@contextlib.contextmanager
+def _no_source_locations() -> Iterator[None]:
+    """Keep the caller's source lines, and so this machine's paths, out of the program."""
+    option = "jax_traceback_in_locations_limit"
+    limit = getattr(jax.config, option)
+    jax.config.update(option, 0)
+    try:
+        yield
+    finally:
+        jax.config.update(option, limit)
+
+
+def _require_flatbuffers() -> None:
+    try:
+        import flatbuffers  # noqa: F401, jax.export serialises with it without requiring it
+    except ImportError as error:
+        raise UserError(
+            "StableHLO files need the package flatbuffers: pip install 'rtd3jax[stablehlo]'"
+        ) from error
+
+
 class StableHlo:
     """A policy loaded from a StableHLO file; jittable, batched.
 
@@ -128,8 +157,10 @@ def load_stablehlo(path: str | os.PathLike) -> StableHlo:
     """The policy that ``policy.export(path, format="stablehlo")`` wrote.
 
     Raises:
-        UserError: when the file is missing, damaged, something else, or of a newer format.
+        UserError: when the file is missing, damaged, something else, or of a newer format; when
+            the package flatbuffers is missing.
     """
+    _require_flatbuffers()
     arrays, about = read_arrays(path)
     if not isinstance(about, dict) or about.get("kind") != _KIND or "program" not in arrays:
         raise UserError(f"{path} is not a policy in StableHLO")
