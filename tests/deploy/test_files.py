@@ -5,8 +5,10 @@ import json
 import subprocess
 import sys
 
+import jax
 import numpy as np
 import onnx
+import onnxruntime
 import pytest
 from random_policies import random_policy
 
@@ -86,6 +88,35 @@ def test_the_numpy_player_refuses_bad_observations_and_forgets_them(tmp_path, po
     player.step([0.0, 0.0])[:] = 9.0
     other.step([0.0, 0.0])
     np.testing.assert_array_equal(player.step([1.0, 2.0]), other.step([1.0, 2.0]))
+
+
+@pytest.mark.parametrize("shape", [(), (1, 2)])
+def test_actions_have_the_shape_of_the_environments(tmp_path, policy, shape):
+    size = int(np.prod(shape))
+    actor = {
+        **policy.actor,
+        "output": {n: a[..., :size] for n, a in policy.actor["output"].items()},
+    }
+    kernel = actor["encoder"]["kernel"]
+    actor["encoder"] = {**actor["encoder"], "kernel": kernel[: 2 + size]}
+    bounds = jax.tree.map(lambda b: b[:size], policy.bounds)
+    shaped = policy.replace(actor=actor, bounds=bounds, action_shape=shape)
+    shaped.save(tmp_path / "p")
+    expected, _ = rtd.load_policy(tmp_path / "p").step(shaped.init(), np.float32([1.0, 2.0]))
+    assert expected.shape == shape
+    for form, name in (("numpy", "p.py"), ("onnx", "p.onnx"), ("stablehlo", "p.stablehlo")):
+        shaped.export(tmp_path / name, format=form)
+    names: dict = {}
+    exec((tmp_path / "p.py").read_text(), names)
+    np.testing.assert_allclose(names["Player"]().step([1.0, 2.0]), expected, atol=1e-5)
+    program = rtd.load_stablehlo(tmp_path / "p.stablehlo")
+    action, _ = program.step(program.init(), [[1.0, 2.0]])
+    np.testing.assert_allclose(action[0], expected, atol=1e-5)
+    session = onnxruntime.InferenceSession(tmp_path / "p.onnx", providers=["CPUExecutionProvider"])
+    state = {name: np.zeros(value.shape, np.float32) for name, value in program.init().items()}
+    action, *_ = session.run(None, {"observation": np.float32([[1.0, 2.0]]), **state})
+    assert action.shape == (1, *shape)
+    np.testing.assert_allclose(action[0], expected, atol=1e-5)
 
 
 def test_a_stablehlo_file_holds_no_path_of_the_machine(program):
