@@ -115,12 +115,12 @@ class Policy:
 
         Args:
             path: of the file.
-            format: ``onnx`` (needs the package onnx), ``stablehlo`` (see
+            format: ``onnx`` (needs the package onnx), ``stablehlo`` (needs flatbuffers; see
                 `rtd3jax.load_stablehlo`) or ``numpy`` (one Python file with a class ``Player``).
             overwrite: replace a file that is there.
 
         Raises:
-            UserError: as `save` does; for an unknown format; when onnx is missing.
+            UserError: as `save` does; for an unknown format; when its package is missing.
         """
         content_of = writer_of(format, str(path))
         check_target(path, overwrite)

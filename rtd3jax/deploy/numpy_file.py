@@ -2,7 +2,6 @@
 
 import base64
 import importlib.resources
-import textwrap
 
 from rtd3jax.deploy.model import Model
 
@@ -15,10 +14,10 @@ def numpy_bytes(model: Model) -> bytes:
     shapes = {name: list(array.shape) for name, array in model.arrays.items()}
     raw = b"".join(array.astype("<f4").tobytes() for array in model.arrays.values())
     about = repr({**model.header(), "arrays": shapes})
-    text = "\n".join(textwrap.wrap(base64.b64encode(raw).decode(), 100))
+    text = base64.encodebytes(raw).decode()
     source = importlib.resources.files("rtd3jax.deploy").joinpath("player.py").read_text()
     assert source.count(_ABOUT) == 1 and source.count(_WEIGHTS) == 1
     source = source.replace(_ABOUT, f"ABOUT: dict[str, Any] = {about}\n")
     # Last, so that no text of the header can be taken for the mark.
     head, tail = source.split(_WEIGHTS)
-    return f'{head}WEIGHTS = """\n{text}\n"""\n{tail}'.encode()
+    return f'{head}WEIGHTS = """\n{text}"""\n{tail}'.encode()
