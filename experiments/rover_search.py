@@ -30,6 +30,7 @@ BASE = {
     "exploration_noise": 0.1,
     "target_noise": 0.2,
     "precision": "float32",
+    "policy_delay": 2,
 }
 CHANGES: tuple[dict, ...] = (
     *(
@@ -53,10 +54,8 @@ CHANGES: tuple[dict, ...] = (
     {
         "final_learning_rate_fraction": 0.0,
         "gamma": 0.0,
-        "learning_rate": 3e-3,
-        "exploration_noise": 0.05,
-        "precision": "bfloat16",
-        "train_on": "sine-slip",
+        "policy_delay": 1,
+        "total_steps": 40_000,
     },
 )
 """What each setting changes in `BASE`."""
