@@ -11,6 +11,9 @@ import numpy as np
 
 from rtd3jax.errors import UserError
 
+DEFAULT_STEP_LIMIT = 10_000
+"""Steps after which an episode is cut where the environment names no time limit of its own."""
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Interface:
