@@ -3,9 +3,16 @@
 from rtd3jax.agents.networks import count_parameters
 from rtd3jax.ceilings import Ceiling, bayes_policy, ceiling
 from rtd3jax.config import ALGORITHMS, Config
+from rtd3jax.envs.check import Finding, check_env, find_problems
+from rtd3jax.envs.disturbances import DampedSine, GaussianNoise, Hidden, Pulses, Sine
+from rtd3jax.envs.disturbed import disturb
+from rtd3jax.envs.faults import Delay, Dropout, GainDrift, OrnsteinUhlenbeck, Quantisation
+from rtd3jax.envs.gymnasium_env import register_with_gymnasium, to_gymnasium
+from rtd3jax.envs.process import Chain, Nothing, Process, Sum
 from rtd3jax.envs.registry import DISTURBANCES, ENVIRONMENTS, make, register
 from rtd3jax.errors import UserError
 from rtd3jax.evaluate import evaluate
+from rtd3jax.play_gymnasium import run_in_gymnasium
 from rtd3jax.policy import Policy, constant_policy, random_policy
 from rtd3jax.training.run import Failure, Run, train
 
@@ -14,18 +21,40 @@ __all__ = [
     "DISTURBANCES",
     "ENVIRONMENTS",
     "Ceiling",
+    "Chain",
     "Config",
+    "DampedSine",
+    "Delay",
+    "Dropout",
     "Failure",
+    "Finding",
+    "GainDrift",
+    "GaussianNoise",
+    "Hidden",
+    "Nothing",
+    "OrnsteinUhlenbeck",
     "Policy",
+    "Process",
+    "Pulses",
+    "Quantisation",
     "Run",
+    "Sine",
+    "Sum",
     "UserError",
     "bayes_policy",
     "ceiling",
+    "check_env",
     "constant_policy",
     "count_parameters",
+    "disturb",
     "evaluate",
+    "find_problems",
     "make",
     "random_policy",
     "register",
+    "run_in_gymnasium",
+    "to_gymnasium",
     "train",
 ]
+
+register_with_gymnasium()

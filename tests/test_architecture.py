@@ -16,6 +16,7 @@ LAYERS = {
     "agents": 2,
     "policy": 3,
     "evaluate": 4,
+    "play_gymnasium": 4,
     "ceilings": 5,
     "training": 5,
     "study": 6,

@@ -147,14 +147,15 @@ def _disturbed(env_id: str, base: Any, disturbance: str, parameters: dict[str, A
     """``base`` with the named disturbance, and ``parameters`` shared out among them."""
     names = disturbance.split("+")
     channels, processes = zip(*_lookup(env_id, disturbance), strict=True)
-    rest, also = dict(parameters), ()
-    reward_from = "state"
+    rest, reward_from = dict(parameters), "state"
+    also: tuple[str, ...] = ()
     if env_id == "pendulum":
         reward_from = rest.pop("reward_from", "observation" if "noise" in names else "state")
         also = ("reward_from",)
     what = f"{env_id} with {disturbance}"
     _check_owners(what, names, processes, rest)
-    *processes, params = _assign(what, (*processes, base.default_params), rest, also)
+    assigned = _assign(what, (*processes, base.default_params), rest, also)
+    processes, params = assigned[:-1], assigned[-1]
     for process in processes:
         process.validate()
     for name in _POSITIVE.get(env_id, ()):
