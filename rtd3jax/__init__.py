@@ -3,6 +3,7 @@
 from rtd3jax.agents.networks import count_parameters
 from rtd3jax.ceilings import Ceiling, bayes_policy, ceiling
 from rtd3jax.config import ALGORITHMS, Config
+from rtd3jax.envs.brax_env import from_brax
 from rtd3jax.envs.check import Finding, check_env, find_problems
 from rtd3jax.envs.disturbances import DampedSine, GaussianNoise, Hidden, Pulses, Sine
 from rtd3jax.envs.disturbed import disturb
@@ -49,6 +50,7 @@ __all__ = [
     "disturb",
     "evaluate",
     "find_problems",
+    "from_brax",
     "make",
     "random_policy",
     "register",
