@@ -2,7 +2,7 @@
 
 import dataclasses
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -240,32 +240,28 @@ def _finite(record: _Record) -> Iterator[Finding]:
 
 def _pure(env: Any, params: Any, record: _Record, seed: int) -> Iterator[Finding]:
     """The same key and state that give another result."""
-    key = jax.random.key(seed)
     state, action = _pick((record.last_state, record.last_action), 0)
-    calls: dict[str, Callable[[], Any]] = {
-        "reset": lambda: env.reset(key, params),
-        "step": lambda: env.step(key, state, action, params),
-    }
-    for what, call in calls.items():
-        results = [_compiled(call, rank) for rank in ("allow", "allow", "warn")]
-        if not all(_equal(results[0], other) for other in results[1:]):
+
+    def both() -> tuple:
+        key = jax.random.key(seed)
+        return env.reset(key, params), env.step(key, state, action, params)
+
+    results = []
+    # The setting changes no number here. But it is part of the key under which JAX keeps programs,
+    # so that the Python code is run again, and what it takes from outside shows.
+    for rank_promotion in ("allow", "warn"):
+        with warnings.catch_warnings(), jax.numpy_rank_promotion(rank_promotion):
+            warnings.simplefilter("ignore")
+            program = jax.jit(lambda: both())
+            results += [program(), program()]
+    for index, what in enumerate(("reset", "step")):
+        if not all(_equal(results[0][index], other[index]) for other in results[1:]):
             yield Finding(
                 "pure",
                 f"{what} gives another result for the same key, state and action",
                 "keep everything that changes in the state, and draw with jax.random from the key",
             )
             return  # an automatic reset is within step
-
-
-def _compiled(call: Callable[[], Any], rank_promotion: str) -> Any:
-    """The call's result from a program traced under this setting.
-
-    The setting changes no number here. But it is part of the key under which JAX keeps programs, so
-    that Python code within is run again, and what it took from outside shows.
-    """
-    with warnings.catch_warnings(), jax.numpy_rank_promotion(rank_promotion):
-        warnings.simplefilter("ignore")
-        return jax.jit(lambda: call())()
 
 
 def _time_limits(record: _Record, limit: Any, steps: int) -> Iterator[Finding]:
