@@ -11,7 +11,14 @@ from typing import Any
 import gymnax
 
 from rtd3jax.envs.disturbances import DampedSine, GaussianNoise, Hidden, Pulses, Sine
-from rtd3jax.envs.disturbed import CHANNELS, Disturbed, DisturbedParams, check_fit, sequence
+from rtd3jax.envs.disturbed import (
+    CHANNELS,
+    Disturbed,
+    DisturbedParams,
+    check_fit,
+    disturb,
+    sequence,
+)
 from rtd3jax.envs.faults import Delay, Dropout, GainDrift, OrnsteinUhlenbeck, Quantisation
 from rtd3jax.envs.identity import ValueIdentity, strong, with_identity
 from rtd3jax.envs.interface import foreign_code
@@ -73,6 +80,7 @@ DISTURBANCES: dict[str, tuple[str, ...]] = {
 joined by ``+``: ``ar1-slip+dropout``."""
 
 _constructors: dict[str, Callable[..., Any]] = {}
+_registered: dict[str, tuple[Any, dict[str, tuple[str, Process]]]] = {}
 
 
 def make(env_id: str, disturbance: str = "none", **parameters: Any) -> Any:
@@ -86,22 +94,65 @@ def make(env_id: str, disturbance: str = "none", **parameters: Any) -> Any:
     """
     if env_id in _constructors:
         return _constructors[env_id](disturbance, **parameters)
+    if env_id in _registered:
+        return _disturbed(env_id, _registered[env_id][0], disturbance, parameters)
     if env_id in _PROCESSES or env_id in gymnax.registered_envs:
         base = {"pendulum": Pendulum, "rover": Rover}.get(env_id, lambda: _make_gymnax(env_id))()
         return _disturbed(env_id, base, disturbance, parameters)
-    known = (*ENVIRONMENTS, *_constructors, *gymnax.registered_envs)
+    known = (*ENVIRONMENTS, *_constructors, *_registered, *gymnax.registered_envs)
     raise UserError(f"unknown environment {env_id!r}{nearest(env_id, known)}")
 
 
-def register(env_id: str, constructor: Callable[..., Any]) -> None:
-    """Let ``make(env_id, disturbance, **parameters)`` call ``constructor`` with the latter two."""
+def register(
+    env_id: str,
+    world: Any,
+    disturbances: dict[str, Process | tuple[str, Process]] | None = None,
+) -> None:
+    """Let ``make`` and the sweep know a world by name.
+
+    Args:
+        env_id: a new id.
+        world: a gymnax >= 1.0 environment, to which ``make`` then gives parameters and disturbances
+            as it does to ours; or a function ``(disturbance, **parameters)`` that returns one and
+            sees to both itself.
+        disturbances: of an environment, beside "none" and ``FAULTS``: the name of each, and its
+            process of the observation or its (channel, process), as `disturb` takes them.
+
+    Raises:
+        UserError: for an id or a name that is taken, or what is no world.
+    """
     if not isinstance(env_id, str) or not env_id:
         raise UserError(f"an environment id must be a non-empty string, not {env_id!r}")
-    if not callable(constructor):
-        raise UserError(f"the constructor of {env_id!r} is not callable")
-    if env_id in _constructors or env_id in _PROCESSES or env_id in gymnax.registered_envs:
+    is_environment = callable(getattr(world, "reset", None)) and callable(
+        getattr(world, "step", None)
+    )
+    if isinstance(world, type) or not (is_environment or callable(world)):
+        raise UserError(f"the world {env_id!r} must be an environment or a function, not {world!r}")
+    if env_id in {*_constructors, *_registered, *_PROCESSES} or env_id in gymnax.registered_envs:
         raise UserError(f"environment {env_id!r} exists already; choose another id")
-    _constructors[env_id] = constructor
+    if is_environment:
+        _registered[env_id] = world, _named_processes(env_id, world, disturbances or {})
+    elif disturbances is not None:
+        raise UserError(f"{env_id!r}: disturbances are for an environment, not for a function")
+    else:
+        _constructors[env_id] = world
+
+
+def _named_processes(
+    env_id: str, world: Any, disturbances: dict[str, Any]
+) -> dict[str, tuple[str, Process]]:
+    """Channel and process of each name, each tried on the world."""
+    named: dict[str, tuple[str, Process]] = {"none": ("observation", Nothing())}
+    for name, value in disturbances.items():
+        if not re.fullmatch(r"[\w.-]+", name) or name in (*named, *_FAULTS):
+            raise UserError(
+                f"{env_id!r}: a disturbance cannot be called {name!r}; choose another name of "
+                "letters, digits, '-', '.' and '_'"
+            )
+        channel, process = value if isinstance(value, tuple) else ("observation", value)
+        disturb(world, process, channel)
+        named[name] = channel, process
+    return named
 
 
 def parse_disturbance(text: str) -> tuple[str, dict[str, Any]]:
@@ -127,20 +178,27 @@ def parse_disturbance(text: str) -> tuple[str, dict[str, Any]]:
     return disturbance.strip(), parameters
 
 
+def _known(env_id: str) -> dict[str, tuple[str, Process]]:
+    """Channel and process of every disturbance of a world, by name."""
+    if env_id in _registered:
+        own = _registered[env_id][1]
+    else:
+        processes = _PROCESSES.get(env_id, {"none": Nothing()})
+        channel = _OWN_CHANNEL.get(env_id, "observation")
+        own = {name: (channel, process) for name, process in processes.items()}
+    return {**own, **_FAULTS}
+
+
 def _lookup(env_id: str, disturbance: str) -> list[tuple[str, Process]]:
     """Channel and process of each part of ``disturbance``."""
-    own = _PROCESSES.get(env_id, {"none": Nothing()})
-    channel = _OWN_CHANNEL.get(env_id, "observation")
-    known = {**{name: (channel, process) for name, process in own.items()}, **_FAULTS}
-    parts = []
+    known = _known(env_id)
     for name in disturbance.split("+"):
         if name not in known:
             raise UserError(
                 f"unknown disturbance {name!r} of {env_id}{nearest(name, known)} "
                 f"(known: {', '.join(known)})"
             )
-        parts.append(known[name])
-    return parts
+    return [known[name] for name in disturbance.split("+")]
 
 
 def _disturbed(env_id: str, base: Any, disturbance: str, parameters: dict[str, Any]) -> Any:
@@ -169,9 +227,10 @@ def _disturbed(env_id: str, base: Any, disturbance: str, parameters: dict[str, A
     if env_id == "rover":
         params = params.replace(slip=on("slip"))
         base = Rover(params)
-    elif env_id != "pendulum":
+    elif env_id in gymnax.registered_envs:
         base = _make_gymnax(env_id, params)
-    if env_id != "pendulum" and all(isinstance(on(channel), Nothing) for channel in CHANNELS):
+    bare = env_id == "rover" or env_id in gymnax.registered_envs
+    if bare and all(isinstance(on(channel), Nothing) for channel in CHANNELS):
         return base
     fields = {field: on(channel) for channel, field in CHANNELS.items()}
     env = Disturbed(base, reward_from, DisturbedParams(env=params, **fields))
@@ -264,11 +323,16 @@ def _assign(
                 f"{what} has no parameter {name!r}{nearest(name, known)} "
                 f"(known: {', '.join(known)})"
             )
-    return tuple(o.replace(**change) for o, change in zip(owners, changes, strict=True))
+    return tuple(
+        owner.replace(**change) if change else owner
+        for owner, change in zip(owners, changes, strict=True)
+    )
 
 
 def _settable(owner: Any) -> dict[str, Any]:
     """The fields that a plain value can set, with their defaults."""
+    if not dataclasses.is_dataclass(owner):  # others' parameters can be anything
+        return {}
     values = {field.name: getattr(owner, field.name) for field in dataclasses.fields(owner)}
     return {name: v for name, v in values.items() if isinstance(v, bool | int | float | tuple)}
 
