@@ -45,20 +45,24 @@ def run_in_gymnasium(policy: Any, gym_env: Any, episodes: int = 10, seed: int = 
 
 def _play(policy: Any, env: Any, episodes: int, seed: int) -> np.ndarray:
     space = _check_fit(policy, env)
-    step = jax.jit(lambda policy, state, observation: policy.step(state, observation))
     returns = np.zeros(episodes)
     # As seeds of their own: neighbouring seeds shall not share episodes.
     for index, episode_seed in enumerate(np.random.SeedSequence(seed).generate_state(episodes)):
         observation, _ = env.reset(seed=int(episode_seed))
         state = policy.init(jax.random.key(int(episode_seed)))
         for _ in range(DEFAULT_STEP_LIMIT):
-            action, state = step(policy, state, np.asarray(observation, np.float32))
+            action, state = _act(policy, state, np.asarray(observation, np.float32))
             action = np.clip(np.asarray(action, space.dtype), space.low, space.high)
             observation, reward, terminated, truncated, _ = env.step(action)
             returns[index] += float(reward)
             if terminated or truncated:
                 break
     return returns
+
+
+@jax.jit
+def _act(policy: Any, state: Any, observation: jax.Array) -> tuple[jax.Array, Any]:
+    return policy.step(state, observation)
 
 
 def _check_fit(policy: Any, env: Any) -> gymnasium.spaces.Box:
@@ -82,14 +86,16 @@ def _check_fit(policy: Any, env: Any) -> gymnasium.spaces.Box:
             f"the policy expects {expected} observation elements, "
             f"the environment gives {observations.shape[0]}"
         )
+    kind = type(policy).__name__
+    if not (callable(getattr(policy, "init", None)) and callable(getattr(policy, "step", None))):
+        raise UserError(f"{kind} is not a policy: it needs init and step")
+    seen = jax.ShapeDtypeStruct(observations.shape, np.float32)
     try:
-        state = jax.eval_shape(policy.init)
-        shape = jax.eval_shape(
-            policy.step, state, jax.ShapeDtypeStruct(observations.shape, np.float32)
-        )[0].shape
-    except AttributeError as error:
+        shape = jax.eval_shape(_act, policy, jax.eval_shape(policy.init), seen)[0].shape
+    except TypeError as error:
         raise UserError(
-            f"{type(policy).__name__} is not a policy: it needs init and step"
+            f"{kind} cannot be compiled; make it a flax.struct.dataclass: "
+            f"{(str(error).splitlines() or [''])[0]}"
         ) from error
     if shape != actions.shape:
         raise UserError(f"the policy's action has shape {shape}, the environment's {actions.shape}")

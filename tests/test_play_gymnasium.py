@@ -31,6 +31,13 @@ class Swing:
         return torque[None], state + jnp.int32(1)
 
 
+class Plain:
+    """Not a pytree."""
+
+    init = Swing.init
+    step = Swing.step
+
+
 def test_its_returns_are_those_of_our_pendulum():
     ours = np.asarray(rtd.evaluate(Swing(), rtd.make("pendulum"), episodes=2_000))
     theirs = rtd.run_in_gymnasium(Swing(), "Pendulum-v1", episodes=60, seed=0)
@@ -79,6 +86,7 @@ def test_a_recurrent_policy_plays_with_its_window():
         ((rtd.constant_policy([0.0, 0.0]), "Pendulum-v1"), r"shape \(2,\)"),
         ((Swing(), rtd.make("pendulum")), "rtd.evaluate"),
         ((object(), "Pendulum-v1"), "not a policy"),
+        ((Plain(), "Pendulum-v1"), "make it a flax.struct.dataclass"),
         ((Swing(), "Pendulum-v1", 0), "episodes"),
         ((Swing(), "Pendulum-v1", 1, -1), "seed"),
     ],

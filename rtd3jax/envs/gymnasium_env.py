@@ -36,7 +36,7 @@ class GymnasiumEnv(gymnasium.Env):
     metadata = {"render_modes": []}
 
     def __init__(self, env: Any, params: Any = None) -> None:
-        self.env = env
+        self.world = env
         self.params = env.default_params if params is None else params
         self.action_space, self.observation_space = _spaces(env, self.params)
         self._key: Any = None
@@ -51,7 +51,7 @@ class GymnasiumEnv(gymnasium.Env):
         super().reset(seed=seed)
         self._key = np.uint32(self.np_random.integers(2**32, dtype=np.uint32))
         self._time, self._over = 0, False
-        observation, self._state = _reset(self.env, self.params, self._key)
+        observation, self._state = _reset(self.world, self.params, self._key)
         return self._observation(observation), {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -61,7 +61,7 @@ class GymnasiumEnv(gymnasium.Env):
         action = np.asarray(action, self.action_space.dtype).reshape(self.action_space.shape)
         time = np.uint32(self._time)
         final, self._state, reward, terminated, truncated, info = _step(
-            self.env, self.params, self._key, time, self._state, action
+            self.world, self.params, self._key, time, self._state, action
         )
         self._time += 1
         self._over = bool(terminated) or bool(truncated)

@@ -170,6 +170,9 @@ def test_what_cannot_be_one_is_named(env, match):
 
 def test_stable_baselines3_trains_on_it():
     sb3 = pytest.importorskip("stable_baselines3")
+    from stable_baselines3.common import env_checker
+
+    env_checker.check_env(rtd.to_gymnasium(rtd.make("rover", "ar1-slip")))
     env = gymnasium.make("rtd3jax/Pendulum-random-sine-v0")
     model = sb3.TD3(
         "MlpPolicy",
