@@ -192,31 +192,28 @@ class _Record:
 
 
 def _episodes(env: Any, params: Any, interface: Interface, seed: int, steps: int) -> _Record:
-    def actions_of(key: jax.Array) -> jax.Array:
-        low, high = jnp.asarray(interface.action_low), jnp.asarray(interface.action_high)
-        flat = jax.random.uniform(key, low.shape, jnp.float32, low, high)
-        return flat.reshape(interface.action_shape)
-
     def episode(key: jax.Array, params: Any) -> tuple:
-        first, state = env.reset(jax.random.fold_in(key, 0), params)
-        start = (state, state, actions_of(key), jnp.array(False))
+        key_reset, key_steps, key_actions = jax.random.split(key, 3)
+        first, state = env.reset(key_reset, params)
+        low, high = jnp.asarray(interface.action_low), jnp.asarray(interface.action_high)
+        actions = jax.random.uniform(key_actions, (steps, *low.shape), jnp.float32, low, high)
+        actions = actions.reshape(steps, *interface.action_shape)
 
-        def step(carry: tuple, time: jax.Array) -> tuple:
+        def step(carry: tuple, inputs: tuple) -> tuple:
             state, last_state, last_action, ended = carry
-            key_step, key_action = jax.random.split(jax.random.fold_in(key, time + 1))
-            action = actions_of(key_action)
+            key, action = inputs
             last_state = jax.tree.map(
                 lambda old, new: jnp.where(ended, old, new), last_state, state
             )
             last_action = jnp.where(ended, last_action, action)
-            seen, state, reward, terminated, truncated, info = env.step(
-                key_step, state, action, params
-            )
+            seen, state, reward, terminated, truncated, info = env.step(key, state, action, params)
             terminated, truncated = terminated.astype(bool), truncated.astype(bool)
             out = (seen, info["final_observation"], reward, terminated, truncated)
             return (state, last_state, last_action, ended | terminated | truncated), out
 
-        played: Any = jax.lax.scan(step, start, jnp.arange(steps))
+        start = (state, state, actions[0], jnp.array(False))
+        inputs = (jax.random.split(key_steps, steps), actions)
+        played: Any = jax.lax.scan(step, start, inputs)
         (_, last_state, last_action, _), out = played
         return first, *out, last_state, last_action
 
@@ -318,13 +315,11 @@ def _leaks(env: Any, params: Any, record: _Record, seed: int) -> Iterator[Findin
         key = jax.random.key(seed)
         first, state, _, terminated, truncated, _ = env.step(key, state, action, params)
 
-        def step(state: Any, time: jax.Array) -> tuple:
-            seen, state, reward, *_ = env.step(
-                jax.random.fold_in(key, time), state, _pick(record.last_action, 0), params
-            )
+        def step(state: Any, key: jax.Array) -> tuple:
+            seen, state, reward, *_ = env.step(key, state, _pick(record.last_action, 0), params)
             return state, (seen, reward)
 
-        played: Any = jax.lax.scan(step, state, jnp.arange(AFTER_RESET))
+        played: Any = jax.lax.scan(step, state, jax.random.split(key, AFTER_RESET))
         return terminated.astype(bool) | truncated.astype(bool), first, *played[1]
 
     both = jax.tree.map(lambda leaf: leaf[pairs], (record.last_state, record.last_action))
