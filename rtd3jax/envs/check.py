@@ -1,6 +1,7 @@
 """What goes wrong with environments in practice, found by playing them."""
 
 import dataclasses
+import functools
 import warnings
 from collections.abc import Iterator
 from typing import Any
@@ -192,11 +193,8 @@ class _Record:
 
 
 def _episodes(env: Any, params: Any, interface: Interface, seed: int, steps: int) -> _Record:
-    def episode(key: jax.Array, params: Any) -> tuple:
-        key_reset, key_steps, key_actions = jax.random.split(key, 3)
-        first, state = env.reset(key_reset, params)
-        low, high = jnp.asarray(interface.action_low), jnp.asarray(interface.action_high)
-        actions = jax.random.uniform(key_actions, (steps, *low.shape), jnp.float32, low, high)
+    def episode(key: jax.Array, keys: jax.Array, actions: jax.Array, params: Any) -> tuple:
+        first, state = env.reset(key, params)
         actions = actions.reshape(steps, *interface.action_shape)
 
         def step(carry: tuple, inputs: tuple) -> tuple:
@@ -212,14 +210,22 @@ def _episodes(env: Any, params: Any, interface: Interface, seed: int, steps: int
             return (state, last_state, last_action, ended | terminated | truncated), out
 
         start = (state, state, actions[0], jnp.array(False))
-        inputs = (jax.random.split(key_steps, steps), actions)
-        played: Any = jax.lax.scan(step, start, inputs)
+        played: Any = jax.lax.scan(step, start, (keys, actions))
         (_, last_state, last_action, _), out = played
         return first, *out, last_state, last_action
 
-    keys = jax.random.split(jax.random.key(seed), EPISODES)
-    played = jax.jit(jax.vmap(episode, in_axes=(0, None)))(keys, params)
+    draws = _draw(seed, interface.action_low, interface.action_high, steps)
+    played = jax.jit(jax.vmap(episode, in_axes=(0, 0, 0, None)))(*draws, params)
     return _Record(*(np.asarray(part) for part in played[:6]), *played[6:])
+
+
+@functools.partial(jax.jit, static_argnames="steps")
+def _draw(seed: jax.Array, low: jax.Array, high: jax.Array, steps: int) -> tuple[jax.Array, ...]:
+    """Keys of resets [E] and steps [E, T], and actions [E, T, A]; compiled once for all worlds."""
+    key_resets, key_steps, key_actions = jax.random.split(jax.random.key(seed), 3)
+    shape = (EPISODES, steps)
+    actions = jax.random.uniform(key_actions, (*shape, *low.shape), jnp.float32, low, high)
+    return jax.random.split(key_resets, EPISODES), jax.random.split(key_steps, shape), actions
 
 
 def _finite(record: _Record) -> Iterator[Finding]:
