@@ -7,6 +7,7 @@ side. The same command again trains what is missing.
 import argparse
 import collections
 import dataclasses
+import importlib
 import json
 import math
 import os
@@ -55,6 +56,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     before = _on_termination(_terminate)
     try:
+        for module in options.imports:
+            _import(module)
         if options.device:
             jax.config.update("jax_default_device", _device(options.device))
         return _run(options)
@@ -293,6 +296,7 @@ def _references(cell: Cell) -> list[Reference]:
     policies: dict[str, Any] = {"random": random_policy(env)}
     if cell.env == "rover":
         params = env.default_params
+        params = getattr(params, "env", params)  # of a rover with faults
         policies["constant"] = constant_policy([params.target_speed, params.target_yaw_rate])
     return [
         Reference(
@@ -382,6 +386,17 @@ def _device(platform: str) -> Any:
         ) from error
 
 
+def _import(module: str) -> None:
+    """Import what registers worlds; found in the working directory too."""
+    sys.path.insert(0, os.getcwd())
+    try:
+        importlib.import_module(module)
+    except ImportError as error:
+        raise UserError(f"--import {module}: {error}") from error
+    finally:
+        sys.path.pop(0)
+
+
 def _check_memory(jobs: Sequence[Job]) -> None:
     """Refuse lanes of which not even one fits."""
     needed, there = max(lane_bytes(jobs).values()), _memory()
@@ -407,13 +422,24 @@ def _parser() -> argparse.ArgumentParser:
         prog="python -m rtd3jax.sweep",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog=f"disturbances:\n{worlds}\n  parameters may follow: noise:sigma=1.0\n\n"
+        epilog=f"disturbances:\n{worlds}\n  parameters may follow: noise:sigma=1.0\n"
+        "  + joins several: ar1-slip+dropout:p=0.2\n\n"
         "example:\n  python -m rtd3jax.sweep --env pendulum --algorithms td3 lstm-td3-1ha1hc \\\n"
         "      --disturbances random-sine noise --history-lengths 1 10 --seeds 5 --out runs/mine",
     )
     study = parser.add_argument_group("the study")
     study.add_argument("--preset", choices=sorted(PRESETS), help="a prepared study")
-    study.add_argument("--env", help=f"{', '.join(ENVIRONMENTS)}, or any id that gymnax makes")
+    study.add_argument(
+        "--env", help=f"{', '.join(ENVIRONMENTS)}, a registered id, or any id that gymnax makes"
+    )
+    study.add_argument(
+        "--import",
+        dest="imports",
+        action="append",
+        default=[],
+        metavar="MODULE",
+        help="a Python module that registers worlds (rtd3jax.register)",
+    )
     study.add_argument("--disturbances", nargs="+", metavar="ID", help="what is hidden [none]")
     study.add_argument("--algorithms", nargs="+", metavar="ID", help=f"{', '.join(ALGORITHMS)}")
     study.add_argument(

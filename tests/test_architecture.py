@@ -19,6 +19,7 @@ LAYERS = {
     "policy": 3,
     "evaluate": 4,
     "saved": 4,
+    "play_gymnasium": 4,
     "ceilings": 5,
     "training": 5,
     "study": 6,
