@@ -31,6 +31,8 @@ BASE = {
     "target_noise": 0.2,
     "precision": "float32",
     "policy_delay": 2,
+    "reward_scale": 1.0,
+    "replay_capacity": 100_000,
 }
 CHANGES: tuple[dict, ...] = (
     *(
@@ -57,6 +59,13 @@ CHANGES: tuple[dict, ...] = (
         "policy_delay": 1,
         "total_steps": 40_000,
     },
+    {
+        "final_learning_rate_fraction": 0.0,
+        "gamma": 0.0,
+        "reward_scale": 10.0,
+        "replay_capacity": 10_000,
+    },
+    {"final_learning_rate_fraction": 0.0, "gamma": 0.0, "replay_capacity": 10_000},
 )
 """What each setting changes in `BASE`."""
 

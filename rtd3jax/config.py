@@ -65,6 +65,12 @@ class Config:
         high=1,
     )
     gamma: float = _field(0.99, "discount factor", traced=True, low=0, high=1)
+    reward_scale: float = _field(
+        1.0,
+        "factor of the rewards that are learned from; returns are reported without it",
+        traced=True,
+        low=0,
+    )
     tau: float = _field(
         0.005, "share of the online weights in a target update", traced=True, low=0, high=1
     )

@@ -29,7 +29,8 @@ from rtd3jax.errors import UserError
 from rtd3jax.evaluate import evaluate
 from rtd3jax.policy import constant_policy, random_policy
 from rtd3jax.study.lock import parse_shard, writer
-from rtd3jax.study.plan import PRESETS, Cell, Grid, cell_jobs, estimate, lane_bytes, make_cells
+from rtd3jax.study.memory import lanes_at_once
+from rtd3jax.study.plan import PRESETS, Cell, Grid, cell_jobs, estimate, make_cells
 from rtd3jax.study.rundir import LOG, Reference, RunDirectory
 from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.lanes import Group, Job, advance_groups, make_groups, workers
@@ -96,9 +97,9 @@ def _run(options: argparse.Namespace) -> int:
     strategy = check_strategy(options.strategy)
     jobs = cell_jobs(cells, seeds, strategy)
     if options.dry_run:
-        print(_plan_text(cells, seeds, jobs))
+        print(_plan_text(cells, seeds, jobs, strategy))
         return 0
-    _check_memory(jobs)
+    at_once = lanes_at_once(jobs, strategy, len(workers()), _memory())
     out = _out(options)
     shard = None if options.shard is None else parse_shard(options.shard)
     if options.fresh:
@@ -106,7 +107,8 @@ def _run(options: argparse.Namespace) -> int:
     directory = RunDirectory(out, cells, seeds, episodes)
     checkpoints = _checkpoints(directory, options.checkpoint_every)
     with writer(directory.path, shard):
-        return _train(directory, _share(jobs, shard), strategy, checkpoints, options.quiet)
+        share = _share(jobs, shard)
+        return _train(directory, share, (strategy, at_once), checkpoints, options.quiet)
 
 
 def _share(jobs: list[Job], shard: tuple[int, int] | None) -> list[Job]:
@@ -115,7 +117,11 @@ def _share(jobs: list[Job], shard: tuple[int, int] | None) -> list[Job]:
 
 
 def _train(
-    directory: RunDirectory, jobs: list[Job], strategy: str, checkpoints: Checkpoints, quiet: bool
+    directory: RunDirectory,
+    jobs: list[Job],
+    how: tuple[str, int],
+    checkpoints: Checkpoints,
+    quiet: bool,
 ) -> int:
     waiting = [job for job in jobs if not directory.is_done(*job.owner)]
     if len(waiting) < len(jobs):
@@ -123,7 +129,10 @@ def _train(
     for job in waiting:
         directory.error_path(*job.owner).unlink(missing_ok=True)
     interrupted = 0
-    groups = make_groups(waiting, strategy, len(workers()))
+    strategy, at_once = how
+    if at_once < len(waiting) and not quiet:
+        print(f"memory for {at_once:,} lanes at once: the others wait for their turn")
+    groups = make_groups(waiting, strategy, len(workers()), at_once)
     references = [r for cell in _worlds(directory.cells) for r in _references(cell)]
     recorder = _Recorder(directory, checkpoints, references)
     try:
@@ -312,9 +321,13 @@ def _label(job: Job) -> str:
     return f"{cell.config.algorithm}{length} {cell.disturbance}"
 
 
-def _plan_text(cells: Sequence[Cell], seeds: Sequence[int], jobs: Sequence[Job]) -> str:
+def _plan_text(
+    cells: Sequence[Cell], seeds: Sequence[int], jobs: Sequence[Job], strategy: str
+) -> str:
     count = len(workers())
     cost = estimate(jobs, count)
+    fit = lanes_at_once(jobs, strategy, count, _memory())
+    waits = f"; {len(jobs) - fit:,} wait for their turn" if fit < len(jobs) else ""
     lines = [f"{len(cells)} cells × {len(seeds)} seeds = {len(jobs)} lanes"]
     for cell in cells:
         config = cell.config
@@ -324,8 +337,11 @@ def _plan_text(cells: Sequence[Cell], seeds: Sequence[int], jobs: Sequence[Job])
         )
     lines += [
         f"programs to compile: {cost.programs}",
-        f"memory: {cost.lane_bytes / 2**20:,.0f} MiB for the state of the largest lane; "
-        f"{len(seeds)} lanes of a cell are held at once",
+        f"memory of the largest lane: {cost.state_bytes / 2**20:,.1f} MiB kept (parameters, "
+        f"optimisers, replay, carries), {cost.working_bytes / 2**20:,.1f} MiB more while it "
+        "advances (activations, gradients)",
+        f"lanes that fit in {_memory() / 2**30:,.1f} GiB"
+        f"{' of a device' if strategy == 'vmap' else ''}: {min(fit, len(jobs)):,}{waits}",
         f"time: about {_duration(cost.seconds)} on {count} "
         f"{'cores' if workers()[0].platform == 'cpu' else 'devices'}, "
         "by a count of operations, without compiling",
@@ -397,18 +413,10 @@ def _import(module: str) -> None:
         sys.path.pop(0)
 
 
-def _check_memory(jobs: Sequence[Job]) -> None:
-    """Refuse lanes of which not even one fits."""
-    needed, there = max(lane_bytes(jobs).values()), _memory()
-    if needed > there:
-        raise UserError(
-            f"one lane needs {needed / 2**30:,.1f} GiB and the machine has {there / 2**30:,.1f}; "
-            "lower replay_capacity or hidden_size"
-        )
-
-
 def _memory() -> int:
-    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    """Bytes of the device's own memory, or of the machine's."""
+    limit = (workers()[0].memory_stats() or {}).get("bytes_limit")
+    return limit or os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 class _Parser(argparse.ArgumentParser):
