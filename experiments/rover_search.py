@@ -66,6 +66,15 @@ CHANGES: tuple[dict, ...] = (
         "replay_capacity": 10_000,
     },
     {"final_learning_rate_fraction": 0.0, "gamma": 0.0, "replay_capacity": 10_000},
+    {"final_learning_rate_fraction": 0.0, "gamma": 0.0, "reward_scale": 100.0},
+    {"final_learning_rate_fraction": 0.0, "gamma": 0.0, "reward_scale": 10.0},
+    {
+        "final_learning_rate_fraction": 0.0,
+        "gamma": 0.0,
+        "reward_scale": 100.0,
+        "precision": "bfloat16",
+        "train_on": "sine-slip",
+    },
 )
 """What each setting changes in `BASE`."""
 

@@ -1,0 +1,227 @@
+"""The paper's rover table: trained on AR(1), sine or no slip; tested on four slip processes.
+
+Usage: python experiments/rover.py [--quick] [--run DIR] [--out DIR] [--steps N] [--report]
+
+Trains six agents under three slips, five seeds each, in a run directory of the sweep; the same
+command goes on with what is missing. Then evaluates every policy there is under the processes of
+the paper's table. Writes rover.md, rover.parquet (a row per policy and process) and rover.png.
+`--report` only evaluates. One setting for all agents: experiments/rover_search.py found it on seeds
+that are not among the five.
+"""
+
+import argparse
+import pathlib
+import sys
+import time
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+
+import rtd3jax as rtd
+from rtd3jax import sweep
+
+sys.path.insert(0, str(pathlib.Path(__file__).parent))
+from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
+
+STEPS = 20_000
+SETTINGS = {
+    "gamma": 0.0,
+    "reward_scale": 100.0,
+    "final_learning_rate_fraction": 0.0,
+    "precision": "float32",
+}
+HISTORY_LENGTH = 1
+SEEDS = 5
+EPISODES = 1_000
+PAPER_EPISODES = 20
+COLUMNS = (
+    ("ar1-slip", "ar1-slip"),
+    ("sine-slip", "ar1-slip"),
+    ("none", "ar1-slip"),
+    ("sine-slip", "ar1-slip-high-variance"),
+    ("sine-slip", "ar1-slip-fast"),
+    ("sine-slip", "ar1-slip-slow"),
+)
+"""(trained on, tested on), as in the paper's Tables."""
+
+_PAPER = """
+td3                -2.92 0.07 -2.94 0.09 -5.21 0.19 -7.75 0.17 -1.73 0.17 -5.33 0.14
+lstm-td3           -1.38 0.08 -2.40 0.29 -5.26 0.14 -7.38 0.97 -2.17 0.24 -2.78 0.38
+lstm-td3-no-action -1.78 0.07 -2.55 0.24 -5.29 0.16 -6.90 0.18 -2.11 0.30 -3.76 0.19
+lstm-td3-1ha1hc    -1.36 0.04 -1.70 0.06 -5.20 0.14 -5.95 0.22 -1.48 0.10 -2.05 0.06
+lstm-td3-1ha2hc    -1.39 0.05 -2.08 0.16 -5.19 0.04 -6.09 0.24 -1.89 0.12 -2.37 0.10
+h-td3              -1.92 0.07 -2.28 0.17 -5.13 0.23 -7.93 1.26 -1.91 0.20 -3.17 0.31
+"""
+PAPER = {
+    name: [f"{mean} ± {deviation}" for mean, deviation in zip(*[iter(numbers)] * 2, strict=True)]
+    for name, *numbers in map(str.split, _PAPER.strip().splitlines())
+}
+"""Mean ± standard deviation over five seeds (Omi et al., the rover's two tables)."""
+
+
+def train(run: pathlib.Path, steps: int, more: list[str]) -> int:
+    """Train what is missing; the sweep's exit status."""
+    flags = [f"--{name.replace('_', '-')}={value}" for name, value in SETTINGS.items()]
+    return sweep.main(
+        [
+            *("--preset", "rover", "--history-lengths", str(HISTORY_LENGTH)),
+            *("--seeds", str(SEEDS), "--total-steps", str(steps), "--out", str(run)),
+            *flags,
+            *more,
+        ]
+    )
+
+
+def evaluate_policies(run: pathlib.Path, episodes: int, known: pd.DataFrame | None):
+    """A row per lane and process: mean over ``episodes`` and over the paper's twenty."""
+    rows, missing = [] if known is None else known.to_dict("records"), []
+    there = {(r["algorithm"], r["trained_on"], r["tested_on"], r["seed"]) for r in rows}
+    for trained, tested in COLUMNS:
+        env = rtd.make("rover", tested)
+        for algorithm in rtd.ALGORITHMS:
+            for seed in range(SEEDS):
+                if (algorithm, trained, tested, seed) in there:
+                    continue
+                try:
+                    policy = rtd.load_policy(
+                        run, algorithm=algorithm, disturbance=trained, seed=seed
+                    )
+                except rtd.UserError as error:
+                    missing.append(str(error))
+                    continue
+                returns = np.asarray(rtd.evaluate(policy, env, episodes, seed=seed))
+                rows.append(
+                    {
+                        "algorithm": algorithm,
+                        "trained_on": trained,
+                        "tested_on": tested,
+                        "seed": seed,
+                        "episodes": episodes,
+                        "mean": float(returns.mean()),
+                        "standard_error": float(returns.std(ddof=1) / np.sqrt(episodes)),
+                        "mean_of_20": float(returns[:PAPER_EPISODES].mean()),
+                    }
+                )
+    return pd.DataFrame(rows), sorted(set(missing))
+
+
+def references(episodes: int) -> dict[str, dict[str, str]]:
+    """The ceiling, and what needs no training, on each process."""
+    rows: dict[str, dict[str, str]] = {}
+    nominal = rtd.make("rover", "ar1-slip")
+    for tested in dict.fromkeys(tested for _, tested in COLUMNS):
+        env = rtd.make("rover", tested)
+        best = rtd.ceiling(env, episodes)
+        rows.setdefault("ceiling", {})[tested] = f"{best.mean:.3f} ± {best.standard_error:.3f}"
+        policies = {
+            "Bayes policy told nominal AR(1) slip": rtd.bayes_policy(nominal),
+            "constant command": rtd.constant_policy([0.5, 0.0]),
+            "uniform random": rtd.random_policy(env),
+        }
+        for name, policy in policies.items():
+            mean = np.mean(rtd.evaluate(policy, env, episodes, seed=0))
+            rows.setdefault(name, {})[tested] = f"{mean:.2f}"
+    return rows
+
+
+def pick(rows: pd.DataFrame, algorithm: str, trained: str, tested: str) -> pd.DataFrame:
+    """The rows of one entry of the table."""
+    return rows[
+        (rows["algorithm"] == algorithm)
+        & (rows["trained_on"] == trained)
+        & (rows["tested_on"] == tested)
+    ]
+
+
+def spread(values: pd.Series) -> str:
+    """Mean ± standard deviation over seeds; with how many, where some are missing."""
+    count = "" if len(values) == SEEDS else f" ({len(values)} of {SEEDS} seeds)"
+    deviation = f" ± {values.std(ddof=1):.2f}" if len(values) > 1 else ""
+    return f"{values.mean():.2f}{deviation}{count}"
+
+
+def table(rows: pd.DataFrame, others: dict[str, dict[str, str]]) -> str:
+    """The paper's two rover tables as one, our numbers above the paper's."""
+    header = ["agent", *(f"{trained} → {tested}" for trained, tested in COLUMNS)]
+    body = []
+    for algorithm in rtd.ALGORITHMS:
+        mine = [f"**{algorithm}**"]
+        for trained, tested in COLUMNS:
+            here = pick(rows, algorithm, trained, tested)
+            mine.append(spread(here["mean"]) if len(here) else "not trained yet")
+        body += [mine, ["paper", *PAPER[algorithm]]]
+    for name, values in others.items():
+        body.append([f"*{name}*", *(values[tested] for _, tested in COLUMNS)])
+    return markdown_table(header, body)
+
+
+def draw(rows: pd.DataFrame, path: pathlib.Path) -> None:
+    """The transfer matrix: mean return of each agent (rows) in each column."""
+    grid = np.full((len(rtd.ALGORITHMS), len(COLUMNS)), np.nan)
+    for i, algorithm in enumerate(rtd.ALGORITHMS):
+        for j, (trained, tested) in enumerate(COLUMNS):
+            here = pick(rows, algorithm, trained, tested)
+            grid[i, j] = here["mean"].mean() if len(here) else np.nan
+    figure = Figure(figsize=(8.4, 3.6), layout="constrained")
+    axes = figure.subplots()
+    image = axes.imshow(grid, cmap="cividis", norm=Normalize(-6.0, -1.0), aspect="auto")
+    for (i, j), value in np.ndenumerate(grid):
+        text = "–" if np.isnan(value) else f"{value:.2f}"
+        dark = np.isnan(value) or value > -3.0
+        axes.text(j, i, text, ha="center", va="center", color="black" if dark else "white")
+    labels = [f"{a.removesuffix('-slip')} →\n{b.replace('ar1-slip-', '')}" for a, b in COLUMNS]
+    axes.set_xticks(range(len(COLUMNS)), [text.replace("ar1-slip", "ar1") for text in labels])
+    axes.set_yticks(range(len(rtd.ALGORITHMS)), rtd.ALGORITHMS)
+    axes.set_title("Rover: mean return over seeds, trained on → tested on")
+    figure.colorbar(image, label="return", extend="min")
+    with mpl.rc_context({"svg.hashsalt": "rtd3jax"}):
+        figure.savefig(path, dpi=150)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
+    parser.add_argument("--run", type=pathlib.Path, default=pathlib.Path("runs/rover"))
+    parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
+    parser.add_argument("--steps", type=int, default=STEPS)
+    parser.add_argument("--report", action="store_true", help="evaluate what there is; no training")
+    options = parser.parse_args(arguments)
+    began, more, steps, episodes = time.time(), [], options.steps, EPISODES
+    if options.quick:
+        steps, episodes = 60, PAPER_EPISODES
+        more = ["--hidden-size=4", "--batch-size=4", "--learning-starts=10", "--eval-every=60"]
+        more += ["--eval-episodes=1", "--final-episodes=1", "--quiet", "--algorithms", "td3"]
+        more += ["--seeds", "1"]
+    status = 0 if options.report else train(options.run, steps, more)
+    if status not in (0, 1):
+        return status
+    kept = options.out / "rover.parquet"
+    known = pd.read_parquet(kept) if options.report and kept.exists() else None
+    rows, missing = evaluate_policies(options.run, episodes, known)
+    if rows.empty:
+        print(f"nothing is trained in {options.run} yet")
+        return 1
+    facts = provenance(
+        steps=steps,
+        history_length=HISTORY_LENGTH,
+        **SETTINGS,
+        seeds=SEEDS,
+        episodes_per_seed=episodes,
+        policies=len(rows.drop_duplicates(["algorithm", "trained_on", "seed"])),
+        missing=len(missing),
+        minutes=round((time.time() - began) / 60, 1),
+    )
+    text = table(rows, references(episodes))
+    write_results(options.out, "rover", rows, text, facts)
+    draw(rows, options.out / "rover.png")
+    print(text)
+    for line in missing:
+        print(f"missing: {line}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

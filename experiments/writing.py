@@ -1,0 +1,39 @@
+"""What every experiment writes beside its picture: a table, and what made it."""
+
+import datetime
+import json
+import os
+import pathlib
+import platform
+
+import jax
+import pandas as pd
+
+RESULTS = pathlib.Path(__file__).parent / "results"
+
+
+def provenance(**facts: object) -> dict[str, object]:
+    """Facts of a run, with versions, device and date."""
+    return {
+        **facts,
+        "date": datetime.date.today().isoformat(),
+        "jax": jax.__version__,
+        "python": platform.python_version(),
+        "device": f"{jax.devices()[0].device_kind}, {os.cpu_count()} cores",
+    }
+
+
+def write_results(
+    out: pathlib.Path, name: str, table: pd.DataFrame, markdown: str, facts: dict[str, object]
+) -> None:
+    """``name``.parquet, ``name``.md and ``name``.json in ``out``."""
+    out.mkdir(parents=True, exist_ok=True)
+    table.to_parquet(out / f"{name}.parquet", index=False)
+    lines = [markdown.rstrip(), "", *(f"- {key}: {value}" for key, value in facts.items())]
+    (out / f"{name}.md").write_text("\n".join(lines) + "\n")
+    (out / f"{name}.json").write_text(json.dumps(facts, indent=1, default=str) + "\n")
+
+
+def markdown_table(header: list[str], rows: list[list[str]]) -> str:
+    """A Markdown table."""
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (header, ["---"] * len(header), *rows))
