@@ -14,9 +14,9 @@ import rtd3jax as rtd
 from rtd3jax.training import lanes
 from rtd3jax.training.run import make_jobs
 
-# A pause lets the chunks under way end while other workers wait, and a run's first chunks are of
-# unknown pace: both must be short beside a measurement. What they cost counts against us.
-_CHUNK_SECONDS, _FIRST_CHUNK = 0.1, 1
+# A measurement ends with the chunks under way, and begins with some of unknown pace: both must be
+# short beside it. What short chunks cost counts against us.
+_CHUNK_SECONDS, _FIRST_CHUNK = 0.2, 1
 
 
 def make_config(algorithm: str, history_length: int, **settings: Any) -> rtd.Config:
@@ -40,36 +40,45 @@ class Lanes:
         devices: int | None = None,
         window: int | None = None,
     ):
-        """``seeds`` lanes, dealt over the configurations in turn; see `make_jobs` for ``window``."""
+        """``seeds`` lanes, dealt over the configurations in turn; ``window`` as in `make_jobs`."""
         configs = [config] if isinstance(config, rtd.Config) else config
         env = rtd.make("rover", "ar1-slip")
         jobs = [
             make_jobs(env, configs[seed % len(configs)], [seed], window=window)[0]
             for seed in range(seeds)
         ]
-        for job in jobs:
-            job.owner = (None, job.owner[1])
-        self.groups = lanes.make_groups(jobs, strategy, devices or len(lanes.workers()))
+        groups = lanes.make_groups(jobs, strategy, devices or len(lanes.workers()))
+        self.groups = [_Clocked(group.jobs) for group in groups]
 
-    def warm_up(self, seconds: float) -> float:
-        """Compile, and run for a while with updates; the seconds until the first chunk's end.
-
-        That is the compile time, and one lane's random steps besides (milliseconds).
-        """
+    def compile(self) -> float:
+        """Seconds until the first chunk's end: compiling, and milliseconds of random steps."""
         began = time.perf_counter()
         self._until(lambda: True)
-        compiling = time.perf_counter() - began
+        return time.perf_counter() - began
+
+    def warm_up(self, seconds: float) -> float:
+        """Compile, and run for a while with updates; the seconds of `compile`."""
+        compiling = self.compile()
         while min(group.step for group in self.groups) <= self._learning_starts:
             self.run(seconds)
         self.run(seconds)
         return compiling
 
     def run(self, seconds: float) -> tuple[int, float]:
-        """Seed-steps done, and seconds taken, in at least so many seconds."""
+        """Seed-steps done, and seconds taken, in at least so many seconds.
+
+        The seconds are the workers' mean: each has its own last chunk, and waits after it.
+        """
         before = self._steps()
+        for group in self.groups:
+            group.ends = {}
         began = time.perf_counter()
         self._until(lambda: time.perf_counter() - began >= seconds)
-        return self._steps() - before, time.perf_counter() - began
+        last: dict[int, float] = {}
+        for group in self.groups:
+            for worker, end in group.ends.items():
+                last[worker] = max(end, last.get(worker, end))
+        return self._steps() - before, float(np.mean(list(last.values()))) - began
 
     def fill_replay(self, steps: int) -> None:
         """As if ``steps`` steps had been done: random rows of 200-step episodes in every slot."""
@@ -110,6 +119,17 @@ class Lanes:
 
         with _short_chunks(), contextlib.suppress(_Pause):
             lanes.advance_groups(self.groups, on_chunk)
+
+
+class _Clocked(lanes.Group):
+    """A group that knows when each worker last advanced it."""
+
+    ends: dict[int, float] = {}
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        super().__setattr__(name, value)
+        if name == "step":
+            self.ends = {**self.ends, threading.get_ident(): time.perf_counter()}
 
 
 class _Pause(Exception):

@@ -18,7 +18,7 @@ torch = pytest.importorskip("torch", reason="PyTorch is not installed: pip insta
 from experiments.benchmarks.numpy_world import Ring, Rover  # noqa: E402
 from experiments.benchmarks.torch_reference import Learner, tensors  # noqa: E402
 
-CAPACITY, STEPS, LENGTH, O, A, WIDTH = 30, 47, 2, 3, 2, 8
+CAPACITY, STEPS, LENGTH, OBS, A, WIDTH = 30, 47, 2, 3, 2, 8
 NUMBERS = [40, 46, 17, 18, 19, 20, 30, 31, 45]  # oldest and newest rows, and episodes' starts
 BOUNDS = td3.Bounds(jnp.array([-2.0, -2.0]), jnp.array([4.0, 4.0]))
 HYPERPARAMETERS = dict(
@@ -36,10 +36,10 @@ HYPERPARAMETERS = dict(
 @pytest.fixture(scope="module")
 def replays():
     """Both replays after the same steps, the ring having wrapped; episodes of 10 steps."""
-    ours, theirs = empty_replay(CAPACITY, O, A, WIDTH), Ring(CAPACITY, O, A, WIDTH)
+    ours, theirs = empty_replay(CAPACITY, OBS, A, WIDTH), Ring(CAPACITY, OBS, A, WIDTH)
     random = np.random.default_rng(0)
     for number in range(STEPS):
-        observation, after = random.standard_normal((2, O)).astype(np.float32)
+        observation, after = random.standard_normal((2, OBS)).astype(np.float32)
         previous, action = random.standard_normal((2, A)).astype(np.float32)
         carry = random.standard_normal((2, WIDTH)).astype(np.float32)
         age, terminated = number % 10, number % 7 == 0
@@ -101,7 +101,7 @@ def test_no_past_at_all_is_an_empty_window(replays):
 def _load(network, params, spec):
     """Put our parameters into their network; columns stand in the order of a token there."""
     order = ("previous_action", "observation", "action")
-    sizes = {"previous_action": A, "observation": O, "action": A}
+    sizes = {"previous_action": A, "observation": OBS, "action": A}
 
     def linear(layer, entry, parts=None):
         kernel = np.asarray(entry["kernel"])
@@ -138,7 +138,7 @@ def _networks(learner, variant):
 
 def _assert_same(theirs, learner, variant):
     """Their networks compute what ours would, weight by weight."""
-    expected = Learner(variant, O, A, WIDTH)
+    expected = Learner(variant, OBS, A, WIDTH)
     for (network, spec), (params, _) in zip(
         _networks(expected, variant), _networks(learner, variant), strict=True
     ):
@@ -157,7 +157,7 @@ def _assert_same(theirs, learner, variant):
 def _learner(variant):
     """A learner all of whose networks differ; drawn by numpy, which compiles nothing."""
     random = np.random.default_rng(3)
-    shapes = jax.eval_shape(lambda: td3.init_learner(jax.random.key(0), variant, O, A, WIDTH))
+    shapes = jax.eval_shape(lambda: td3.init_learner(jax.random.key(0), variant, OBS, A, WIDTH))
     zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
     networks = {
         name: jax.tree.map(
@@ -194,7 +194,7 @@ def test_an_update_is_the_same(batches, name):
     y, loss, after, gaussian = _update(variant, before, batch)
     theirs = Learner(
         variant,
-        O,
+        OBS,
         A,
         WIDTH,
         low=-2.0,
