@@ -67,7 +67,7 @@ class Sizes:
 
 
 # One replay size and one length, so that one program is compiled.
-QUICK = Sizes(8, 10, 200, 64, 200, 200, lanes_length=1)
+QUICK = Sizes(8, 10, 211, 64, 211, 211, lanes_length=1)
 
 
 class Measurements:

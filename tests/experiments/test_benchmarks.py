@@ -1,13 +1,15 @@
 """The benchmarks run in their quick form, resume, and report what was measured."""
 
 import json
+import re
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from experiments.benchmarks import bench, lanes_on_device, report
-from experiments.benchmarks.torch_processes import ONE_PROCESS, PROCESS_PER_CORE
+from experiments.benchmarks.torch_processes import ONE_PROCESS, PROCESS_PER_CORE, ROOT
+from rtd3jax.training import lanes
 
 QUICK = ["--quick", "--no-torch", "--out"]
 
@@ -47,6 +49,21 @@ def test_another_machine_is_refused_and_kept_aside(measured, monkeypatch, capsys
     bench.Measurements(measured / "measurements.csv", True, "another")
     assert (measured / "measurements.csv.old-1").read_bytes() == before
     (measured / "measurements.csv.old-1").rename(measured / "measurements.csv")
+
+
+def test_no_step_copies_the_replay(measured):
+    """The compiled program of the quick benchmark, whose capacity no other array has."""
+    capacity = bench.QUICK.replay_capacity
+    texts = [
+        entry.executables[1].as_text()
+        for (program, *_), entry in lanes._programs.items()
+        if program.config.replay_capacity == capacity
+    ]
+    assert texts
+    for text in texts:
+        lines = [line for line in text.splitlines() if f"[{capacity}" in line]
+        assert any("dynamic-update-slice" in line for line in lines)
+        assert not [line for line in lines if " copy(" in line]
 
 
 def test_quick_results_do_not_mix_with_real_ones(capsys):
@@ -138,3 +155,11 @@ def test_the_torch_worker_trains(agent):
     assert json.loads(json.dumps(worker.prepare(**order, **sizes))) == {"seeds": 2}
     answer = worker.run(0.01)
     assert answer["steps"] > 0 and answer["seconds"] >= 0.01
+
+
+def test_the_documentations_counts_are_those_of_the_code(capsys):
+    text = (ROOT / "docs" / "how_it_is_fast.md").read_text()
+    (block,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    exec(compile(block, "how_it_is_fast.md", "exec"), {})
+    shown = [line.removeprefix("# ") for line in block.splitlines() if line.startswith("# ")]
+    assert capsys.readouterr().out.splitlines() == shown
