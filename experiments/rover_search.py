@@ -29,6 +29,10 @@ BASE = {
     "gamma": 0.99,
     "exploration_noise": 0.1,
     "target_noise": 0.2,
+    "precision": "float32",
+    "policy_delay": 2,
+    "reward_scale": 1.0,
+    "replay_capacity": 100_000,
 }
 CHANGES: tuple[dict, ...] = (
     *(
@@ -42,7 +46,26 @@ CHANGES: tuple[dict, ...] = (
     {"final_learning_rate_fraction": 0.0, "gamma": 0.0},
     {"final_learning_rate_fraction": 0.0, "gamma": 0.0, "learning_rate": 3e-3},
     {"final_learning_rate_fraction": 0.0, "gamma": 0.0, "exploration_noise": 0.2},
-    {"final_learning_rate_fraction": 0.0, "gamma": 0.0, "total_steps": 60_000},
+    {
+        "final_learning_rate_fraction": 0.0,
+        "gamma": 0.0,
+        "learning_rate": 3e-3,
+        "exploration_noise": 0.05,
+        "precision": "bfloat16",
+    },
+    {
+        "final_learning_rate_fraction": 0.0,
+        "gamma": 0.0,
+        "policy_delay": 1,
+        "total_steps": 40_000,
+    },
+    {
+        "final_learning_rate_fraction": 0.0,
+        "gamma": 0.0,
+        "reward_scale": 10.0,
+        "replay_capacity": 10_000,
+    },
+    {"final_learning_rate_fraction": 0.0, "gamma": 0.0, "replay_capacity": 10_000},
 )
 """What each setting changes in `BASE`."""
 

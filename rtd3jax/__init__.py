@@ -3,9 +3,19 @@
 from rtd3jax.agents.networks import count_parameters
 from rtd3jax.ceilings import Ceiling, bayes_policy, ceiling
 from rtd3jax.config import ALGORITHMS, Config
+from rtd3jax.deploy.stablehlo_file import load_stablehlo
+from rtd3jax.envs.brax_env import from_brax
+from rtd3jax.envs.check import Finding, check_env, find_problems
+from rtd3jax.envs.disturbances import DampedSine, GaussianNoise, Hidden, Pulses, Sine
+from rtd3jax.envs.disturbed import disturb
+from rtd3jax.envs.faults import Delay, Dropout, GainDrift, OrnsteinUhlenbeck, Quantisation
+from rtd3jax.envs.gymnasium_env import register_with_gymnasium, to_gymnasium
+from rtd3jax.envs.process import Chain, Nothing, Process, Sum
 from rtd3jax.envs.registry import DISTURBANCES, ENVIRONMENTS, make, register
 from rtd3jax.errors import UserError
 from rtd3jax.evaluate import evaluate
+from rtd3jax.load import load_policy
+from rtd3jax.play_gymnasium import run_in_gymnasium
 from rtd3jax.policy import Policy, constant_policy, random_policy
 from rtd3jax.training.run import Failure, Run, train
 
@@ -14,18 +24,43 @@ __all__ = [
     "DISTURBANCES",
     "ENVIRONMENTS",
     "Ceiling",
+    "Chain",
     "Config",
+    "DampedSine",
+    "Delay",
+    "Dropout",
     "Failure",
+    "Finding",
+    "GainDrift",
+    "GaussianNoise",
+    "Hidden",
+    "Nothing",
+    "OrnsteinUhlenbeck",
     "Policy",
+    "Process",
+    "Pulses",
+    "Quantisation",
     "Run",
+    "Sine",
+    "Sum",
     "UserError",
     "bayes_policy",
     "ceiling",
+    "check_env",
     "constant_policy",
     "count_parameters",
+    "disturb",
     "evaluate",
+    "load_policy",
+    "load_stablehlo",
+    "find_problems",
+    "from_brax",
     "make",
     "random_policy",
     "register",
+    "run_in_gymnasium",
+    "to_gymnasium",
     "train",
 ]
+
+register_with_gymnasium()

@@ -15,7 +15,7 @@ from jax.scipy.stats import norm
 
 from rtd3jax.envs.process import Nothing, Process
 from rtd3jax.envs.rover import Rover, RoverParams
-from rtd3jax.envs.slip import Ar1Slip, SineSlip
+from rtd3jax.envs.slip import WHEELS, Ar1Slip, SineSlip
 from rtd3jax.errors import UserError
 from rtd3jax.evaluate import evaluate
 
@@ -116,7 +116,8 @@ def _sine_bound(params: RoverParams, episodes: int, seed: int) -> Ceiling:
     constant command under the prior.
     """
     keys = jax.random.split(jax.random.key(seed), episodes)
-    slip = jax.vmap(lambda key: params.slip.init(key, params.max_steps_in_episode).slip)(keys)
+    horizon = params.max_steps_in_episode
+    slip = jax.vmap(lambda key: params.slip.init(key, horizon, WHEELS).slip)(keys)
     traction = 1.0 - slip
     nominal = _best_wheel_speeds(params, traction.mean(0), (traction**2).mean(0))
     realised = traction * nominal[None, :]

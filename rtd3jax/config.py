@@ -22,6 +22,8 @@ ALGORITHMS = (
 )
 """The six agents of the paper; ``rtd3jax.agents.variants`` says what each reads."""
 
+PRECISIONS = ("float32", "bfloat16")
+
 DEFAULT_HISTORY_LENGTH = 10
 
 
@@ -63,6 +65,12 @@ class Config:
         high=1,
     )
     gamma: float = _field(0.99, "discount factor", traced=True, low=0, high=1)
+    reward_scale: float = _field(
+        1.0,
+        "factor of the rewards that are learned from; returns are reported without it",
+        traced=True,
+        low=0,
+    )
     tau: float = _field(
         0.005, "share of the online weights in a target update", traced=True, low=0, high=1
     )
@@ -82,6 +90,13 @@ class Config:
     replay_capacity: int | None = _field(
         None, "transitions kept; the oldest leave first [total_steps]", low=1
     )
+    precision: str = dataclasses.field(
+        default="float32",
+        metadata={
+            "help": "of the factors of wide products in updates: float32, bfloat16",
+            "traced": False,
+        },
+    )
     eval_every: int = _field(1_000, "environment steps between evaluations", low=1)
     eval_episodes: int = _field(10, "episodes of an evaluation", low=1)
 
@@ -90,6 +105,11 @@ class Config:
             raise UserError(
                 f"algorithm {self.algorithm!r} is unknown{nearest(str(self.algorithm), ALGORITHMS)}"
                 f"; the algorithms are {', '.join(ALGORITHMS)}"
+            )
+        if self.precision not in PRECISIONS:
+            raise UserError(
+                f"precision {self.precision!r} is unknown{nearest(str(self.precision), PRECISIONS)}"
+                f"; there are {' and '.join(PRECISIONS)}"
             )
         self._resolve_history_length()
         for field in dataclasses.fields(self):

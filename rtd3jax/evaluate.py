@@ -6,11 +6,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from rtd3jax.envs.interface import describe, foreign_code
+from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT, describe, foreign_code
 from rtd3jax.errors import UserError
-
-DEFAULT_STEP_LIMIT = 10_000
-"""Steps after which an episode is cut where the environment names no time limit of its own."""
 
 
 def evaluate(

@@ -4,18 +4,29 @@ All share one interface: ``state = policy.init()``, then at each step
 ``action, state = policy.step(state, observation)``.
 """
 
+import os
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from rtd3jax.agents.networks import Params
 from rtd3jax.agents.td3 import Bounds, act
 from rtd3jax.agents.variants import VARIANTS
 from rtd3jax.agents.windows import Steps, Window, empty_steps, past_tokens, put_step
+from rtd3jax.deploy.formats import writer_of
+from rtd3jax.deploy.model import Model, fold
 from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
+from rtd3jax.files import array_bytes, check_target, flatten, write_new
+from rtd3jax.versions import versions_of
+
+FORMAT = 1
+"""Of saved policies; raised when older versions could not read them."""
+
+KIND = "policy"
 
 
 @struct.dataclass
@@ -88,6 +99,68 @@ class Policy:
         steps = put_step(state.steps, state.time, Steps(observation, state.previous_action, action))
         state = PolicyState(steps, action, state.time + jnp.int32(1))
         return action.reshape(self.action_shape), state
+
+    def save(self, path: str | os.PathLike, overwrite: bool = False) -> None:
+        """Write the policy to a safetensors file, for `rtd3jax.load_policy`.
+
+        Raises:
+            UserError: when the file exists and ``overwrite`` is false, or cannot be written; when
+                weights are not finite; for a batch of policies.
+        """
+        check_target(path, overwrite)
+        write_new(path, array_bytes(flatten(self._actor()), self._about()), overwrite)
+
+    def export(self, path: str | os.PathLike, format: str, overwrite: bool = False) -> None:
+        """Write the policy in a form that runs without rtd3jax.
+
+        Args:
+            path: of the file.
+            format: ``onnx`` (needs the package onnx), ``stablehlo`` (needs flatbuffers; see
+                `rtd3jax.load_stablehlo`) or ``numpy`` (one Python file with a class ``Player``).
+            overwrite: replace a file that is there.
+
+        Raises:
+            UserError: as `save` does; for an unknown format; when its package is missing.
+        """
+        content_of = writer_of(format, str(path))
+        check_target(path, overwrite)
+        actor, reads = self._actor(), VARIANTS[self.algorithm].actor
+        model = Model(
+            memory=reads.memory,
+            memory_has_current=reads.memory_has_current,
+            current=reads.current,
+            history_length=int(self.history_length),
+            observation_size=self.observation_size,
+            action_shape=self.action_shape,
+            arrays=fold(actor, self.bounds.low, self.bounds.high),
+            about=self._about(),
+        )
+        write_new(path, content_of(model), overwrite)
+
+    def _actor(self) -> Params:
+        """The parameters on the host, checked."""
+        if self.history_length.ndim != 0:
+            raise UserError("this is a batch of policies; save or export them one by one")
+        actor = jax.tree.map(np.asarray, self.actor)
+        for name, array in flatten(actor).items():
+            if not np.all(np.isfinite(array)):
+                raise UserError(f"the policy's weights are not finite ({name}); it cannot be used")
+        return actor
+
+    def _about(self) -> dict[str, Any]:
+        """The header of a file that holds the policy."""
+        return {
+            "kind": KIND,
+            "format": FORMAT,
+            "algorithm": self.algorithm,
+            "history_length": int(self.history_length),
+            "observation_size": self.observation_size,
+            "action_shape": list(self.action_shape),
+            "action_low": np.asarray(self.bounds.low).tolist(),
+            "action_high": np.asarray(self.bounds.high).tolist(),
+            "hidden_size": int(self.actor["head"]["bias"].shape[-1]),
+            "versions": versions_of(("rtd3jax", "jax", "jaxlib", "numpy")),
+        }
 
 
 @struct.dataclass

@@ -7,6 +7,7 @@ side. The same command again trains what is missing.
 import argparse
 import collections
 import dataclasses
+import importlib
 import json
 import math
 import os
@@ -28,7 +29,8 @@ from rtd3jax.errors import UserError
 from rtd3jax.evaluate import evaluate
 from rtd3jax.policy import constant_policy, random_policy
 from rtd3jax.study.lock import parse_shard, writer
-from rtd3jax.study.plan import PRESETS, Cell, Grid, cell_jobs, estimate, lane_bytes, make_cells
+from rtd3jax.study.memory import lanes_at_once
+from rtd3jax.study.plan import PRESETS, Cell, Grid, cell_jobs, estimate, make_cells
 from rtd3jax.study.rundir import LOG, Reference, RunDirectory
 from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.lanes import Group, Job, advance_groups, make_groups, workers
@@ -55,6 +57,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     before = _on_termination(_terminate)
     try:
+        for module in options.imports:
+            _import(module)
         if options.device:
             jax.config.update("jax_default_device", _device(options.device))
         return _run(options)
@@ -93,9 +97,9 @@ def _run(options: argparse.Namespace) -> int:
     strategy = check_strategy(options.strategy)
     jobs = cell_jobs(cells, seeds, strategy)
     if options.dry_run:
-        print(_plan_text(cells, seeds, jobs))
+        print(_plan_text(cells, seeds, jobs, strategy))
         return 0
-    _check_memory(jobs)
+    at_once = lanes_at_once(jobs, strategy, len(workers()), _memory())
     out = _out(options)
     shard = None if options.shard is None else parse_shard(options.shard)
     if options.fresh:
@@ -103,7 +107,8 @@ def _run(options: argparse.Namespace) -> int:
     directory = RunDirectory(out, cells, seeds, episodes)
     checkpoints = _checkpoints(directory, options.checkpoint_every)
     with writer(directory.path, shard):
-        return _train(directory, _share(jobs, shard), strategy, checkpoints, options.quiet)
+        share = _share(jobs, shard)
+        return _train(directory, share, (strategy, at_once), checkpoints, options.quiet)
 
 
 def _share(jobs: list[Job], shard: tuple[int, int] | None) -> list[Job]:
@@ -112,7 +117,11 @@ def _share(jobs: list[Job], shard: tuple[int, int] | None) -> list[Job]:
 
 
 def _train(
-    directory: RunDirectory, jobs: list[Job], strategy: str, checkpoints: Checkpoints, quiet: bool
+    directory: RunDirectory,
+    jobs: list[Job],
+    how: tuple[str, int],
+    checkpoints: Checkpoints,
+    quiet: bool,
 ) -> int:
     waiting = [job for job in jobs if not directory.is_done(*job.owner)]
     if len(waiting) < len(jobs):
@@ -120,7 +129,10 @@ def _train(
     for job in waiting:
         directory.error_path(*job.owner).unlink(missing_ok=True)
     interrupted = 0
-    groups = make_groups(waiting, strategy, len(workers()))
+    strategy, at_once = how
+    if at_once < len(waiting) and not quiet:
+        print(f"memory for {at_once:,} lanes at once: the others wait for their turn")
+    groups = make_groups(waiting, strategy, len(workers()), at_once)
     references = [r for cell in _worlds(directory.cells) for r in _references(cell)]
     recorder = _Recorder(directory, checkpoints, references)
     try:
@@ -293,6 +305,7 @@ def _references(cell: Cell) -> list[Reference]:
     policies: dict[str, Any] = {"random": random_policy(env)}
     if cell.env == "rover":
         params = env.default_params
+        params = getattr(params, "env", params)  # of a rover with faults
         policies["constant"] = constant_policy([params.target_speed, params.target_yaw_rate])
     return [
         Reference(
@@ -308,9 +321,13 @@ def _label(job: Job) -> str:
     return f"{cell.config.algorithm}{length} {cell.disturbance}"
 
 
-def _plan_text(cells: Sequence[Cell], seeds: Sequence[int], jobs: Sequence[Job]) -> str:
+def _plan_text(
+    cells: Sequence[Cell], seeds: Sequence[int], jobs: Sequence[Job], strategy: str
+) -> str:
     count = len(workers())
     cost = estimate(jobs, count)
+    fit = lanes_at_once(jobs, strategy, count, _memory())
+    waits = f"; {len(jobs) - fit:,} wait for their turn" if fit < len(jobs) else ""
     lines = [f"{len(cells)} cells × {len(seeds)} seeds = {len(jobs)} lanes"]
     for cell in cells:
         config = cell.config
@@ -320,8 +337,11 @@ def _plan_text(cells: Sequence[Cell], seeds: Sequence[int], jobs: Sequence[Job])
         )
     lines += [
         f"programs to compile: {cost.programs}",
-        f"memory: {cost.lane_bytes / 2**20:,.0f} MiB for the state of the largest lane; "
-        f"{len(seeds)} lanes of a cell are held at once",
+        f"memory of the largest lane: {cost.state_bytes / 2**20:,.1f} MiB kept (parameters, "
+        f"optimisers, replay, carries), {cost.working_bytes / 2**20:,.1f} MiB more while it "
+        "advances (activations, gradients)",
+        f"lanes that fit in {_memory() / 2**30:,.1f} GiB"
+        f"{' of a device' if strategy == 'vmap' else ''}: {min(fit, len(jobs)):,}{waits}",
         f"time: about {_duration(cost.seconds)} on {count} "
         f"{'cores' if workers()[0].platform == 'cpu' else 'devices'}, "
         "by a count of operations, without compiling",
@@ -382,18 +402,21 @@ def _device(platform: str) -> Any:
         ) from error
 
 
-def _check_memory(jobs: Sequence[Job]) -> None:
-    """Refuse lanes of which not even one fits."""
-    needed, there = max(lane_bytes(jobs).values()), _memory()
-    if needed > there:
-        raise UserError(
-            f"one lane needs {needed / 2**30:,.1f} GiB and the machine has {there / 2**30:,.1f}; "
-            "lower replay_capacity or hidden_size"
-        )
+def _import(module: str) -> None:
+    """Import what registers worlds; found in the working directory too."""
+    sys.path.insert(0, os.getcwd())
+    try:
+        importlib.import_module(module)
+    except ImportError as error:
+        raise UserError(f"--import {module}: {error}") from error
+    finally:
+        sys.path.pop(0)
 
 
 def _memory() -> int:
-    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    """Bytes of the device's own memory, or of the machine's."""
+    limit = (workers()[0].memory_stats() or {}).get("bytes_limit")
+    return limit or os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 class _Parser(argparse.ArgumentParser):
@@ -407,13 +430,24 @@ def _parser() -> argparse.ArgumentParser:
         prog="python -m rtd3jax.sweep",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog=f"disturbances:\n{worlds}\n  parameters may follow: noise:sigma=1.0\n\n"
+        epilog=f"disturbances:\n{worlds}\n  parameters may follow: noise:sigma=1.0\n"
+        "  + joins several: ar1-slip+dropout:p=0.2\n\n"
         "example:\n  python -m rtd3jax.sweep --env pendulum --algorithms td3 lstm-td3-1ha1hc \\\n"
         "      --disturbances random-sine noise --history-lengths 1 10 --seeds 5 --out runs/mine",
     )
     study = parser.add_argument_group("the study")
     study.add_argument("--preset", choices=sorted(PRESETS), help="a prepared study")
-    study.add_argument("--env", help=f"{', '.join(ENVIRONMENTS)}, or any id that gymnax makes")
+    study.add_argument(
+        "--env", help=f"{', '.join(ENVIRONMENTS)}, a registered id, or any id that gymnax makes"
+    )
+    study.add_argument(
+        "--import",
+        dest="imports",
+        action="append",
+        default=[],
+        metavar="MODULE",
+        help="a Python module that registers worlds (rtd3jax.register)",
+    )
     study.add_argument("--disturbances", nargs="+", metavar="ID", help="what is hidden [none]")
     study.add_argument("--algorithms", nargs="+", metavar="ID", help=f"{', '.join(ALGORITHMS)}")
     study.add_argument(
@@ -446,10 +480,11 @@ def _parser() -> argparse.ArgumentParser:
     for field in dataclasses.fields(Config):
         if field.name not in _GRID_FIELDS:
             default = "" if field.default is None else f" [{field.default}]"
+            kind = {"str": str, "float": float}.get(str(getattr(field.type, "__name__", "")), int)
             config.add_argument(
                 "--" + field.name.replace("_", "-"),
-                type=int if "int" in str(field.type) else float,
-                metavar="N",
+                type=kind,
+                metavar="NAME" if kind is str else "N",
                 help=field.metadata["help"].replace("%", "%%") + default,
             )
     return parser

@@ -11,15 +11,21 @@ ROOT = pathlib.Path(rtd3jax.__file__).parent
 LAYERS = {
     "errors": 0,
     "files": 1,
+    "versions": 1,
     "config": 1,
     "envs": 2,
     "agents": 2,
+    "deploy": 2,
     "policy": 3,
     "evaluate": 4,
+    "saved": 4,
+    "play_gymnasium": 4,
     "ceilings": 5,
     "training": 5,
     "study": 6,
+    "load": 7,
     "sweep": 7,
+    "export": 8,
 }
 
 

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from rtd3jax import sweep
-from rtd3jax.study.plan import PRESETS, make_cells
+from rtd3jax.config import Config
+from rtd3jax.envs import registry
+from rtd3jax.study.plan import PRESETS, Cell, make_cells
 from rtd3jax.study.results import CURVES, EPISODES, read_table
 
 TINY = [
@@ -224,3 +226,21 @@ def test_a_full_disk_is_one_line_and_loses_nothing(tmp_path, monkeypatch, capsys
     assert "No space left on device" in error and error.count("\n") == 1
     assert not list(out.rglob("*.tmp"))
     assert sweep.main([*TINY, "--out", str(out)]) == 0
+
+
+def test_a_module_that_registers_worlds_can_be_imported(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(registry, "_registered", {})
+    (tmp_path / "own_worlds.py").write_text(
+        "import rtd3jax as rtd\nrtd.register('own', rtd.make('rover'))\n"
+    )
+    arguments = ["--env", "own", "--disturbances", "delay:steps=3", "--algorithms", "td3"]
+    assert sweep.main([*arguments, "--dry-run", "--import", "own_worlds"]) == 0
+    assert "own        delay:steps=3" in capsys.readouterr().out
+    assert sweep.main([*arguments, "--import", "no_such_worlds"]) == 2
+    assert "--import no_such_worlds: No module named" in capsys.readouterr().err
+
+
+def test_a_rover_with_faults_has_the_constant_command_too():
+    cell = Cell("rover", "ar1-slip+gain-drift", Config(algorithm="td3"))
+    assert [row.name for row in sweep._references(cell)] == ["random", "constant"]

@@ -8,11 +8,14 @@ so that each weight's gradient is one large product after it. `reference` is the
 that the tests compare with.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
+
+from rtd3jax.agents.products import narrow, product, weight_gradient
 
 Params = dict[str, jax.Array]
 
@@ -46,7 +49,13 @@ def zero_carry(batch: int, width: int) -> Carry:
     return Carry(zeros, zeros)
 
 
-def lstm(params: Params, inputs: jax.Array, exists: jax.Array, carry: Carry) -> Carry:
+def lstm(
+    params: Params,
+    inputs: jax.Array,
+    exists: jax.Array,
+    carry: Carry,
+    precision: str = "float32",
+) -> Carry:
     """The carry after all tokens.
 
     Args:
@@ -56,8 +65,10 @@ def lstm(params: Params, inputs: jax.Array, exists: jax.Array, carry: Carry) -> 
             that it stands before all that exist and that its carry is zero, as in a window: the
             candidate is then masked, which keeps a zero carry zero at no cost.
         carry: what the LSTM starts from.
+        precision: of the products' factors; see `rtd3jax.agents.products`.
     """
     return _lstm(
+        precision,
         params["input_kernel"],
         params["recurrent_kernel"],
         params["input_bias"] + params["recurrent_bias"],
@@ -79,53 +90,68 @@ def reference(params: Params, inputs: jax.Array, exists: jax.Array, carry: Carry
     return carry
 
 
-def _sigmoid(x: jax.Array) -> jax.Array:
-    # One tanh is cheaper here than the logistic's exponential and division.
-    return 0.5 * jnp.tanh(0.5 * x) + 0.5
-
-
 def _project(input_kernel: jax.Array, bias: jax.Array, inputs: jax.Array) -> jax.Array:
     tokens, batch, size = inputs.shape
-    flat = inputs.reshape(tokens * batch, size) @ input_kernel + bias[None, :]
+    flat = product(inputs.reshape(tokens * batch, size), input_kernel) + bias[None, :]
     return flat.reshape(tokens, batch, -1)
 
 
-def _cell(gates: jax.Array, exists: jax.Array, cell: jax.Array):
-    i, f, g, o = jnp.split(gates, 4, axis=-1)
-    i, f, o = _sigmoid(i), _sigmoid(f), _sigmoid(o)
-    g = jnp.where(exists[:, None], jnp.tanh(g), 0.0)
+def _activate(gates: jax.Array, exists: jax.Array):
+    """i, f, g, o [B, H] each from the gates' sums [B, 4H], the candidate g masked.
+
+    One tanh for all four, as ``sigmoid(x) = tanh(x/2)/2 + 1/2``, and a barrier after it: XLA's CPU
+    backend does not vectorise a tanh that is fused with slices, and takes five times as long.
+    """
+    width = gates.shape[-1] // 4
+    half, one = jnp.full((width,), 0.5, gates.dtype), jnp.ones((width,), gates.dtype)
+    scales = jnp.concatenate((half, half, one, half))
+    squashed = lax.optimization_barrier(jnp.tanh(scales[None, :] * gates))
+    i, f, g, o = jnp.split(squashed, 4, axis=-1)
+    return 0.5 * i + 0.5, 0.5 * f + 0.5, jnp.where(exists[:, None], g, 0.0), 0.5 * o + 0.5
+
+
+def _cell(activations, cell: jax.Array) -> Carry:
+    i, f, g, o = activations
     cell = f * cell + i * g
-    return (i, f, g, o), cell, o * jnp.tanh(cell)
+    return Carry(o * jnp.tanh(cell), cell)
 
 
-@jax.custom_vjp
-def _lstm(input_kernel, recurrent_kernel, bias, inputs, exists, carry: Carry) -> Carry:
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _lstm(precision, input_kernel, recurrent_kernel, bias, inputs, exists, carry: Carry) -> Carry:
+    input_kernel, recurrent_kernel, inputs = (
+        narrow(factor, precision) for factor in (input_kernel, recurrent_kernel, inputs)
+    )
     projected = _project(input_kernel, bias, inputs)
 
     def token(carry: Carry, x):
         gates, there = x
-        _, cell, hidden = _cell(gates + carry.hidden @ recurrent_kernel, there, carry.cell)
-        return Carry(hidden, cell), None
+        recurrent = product(narrow(carry.hidden, precision), recurrent_kernel)
+        return _cell(_activate(gates + recurrent, there), carry.cell), None
 
     return lax.scan(token, carry, (projected, exists))[0]
 
 
-def _forward(input_kernel, recurrent_kernel, bias, inputs, exists, carry: Carry):
+def _forward(precision, input_kernel, recurrent_kernel, bias, inputs, exists, carry: Carry):
+    input_kernel, recurrent_kernel, inputs = (
+        narrow(factor, precision) for factor in (input_kernel, recurrent_kernel, inputs)
+    )
     projected = _project(input_kernel, bias, inputs)
 
     def token(carry: Carry, x):
         gates, there = x
-        activations, cell, hidden = _cell(
-            gates + carry.hidden @ recurrent_kernel, there, carry.cell
-        )
-        return Carry(hidden, cell), (carry, activations)
+        recurrent = product(narrow(carry.hidden, precision), recurrent_kernel)
+        activations = _activate(gates + recurrent, there)
+        # Stacked in float32: XLA's CPU backend writes into a stack of bfloat16 by converting all
+        # of it, there and back, at every token.
+        return _cell(activations, carry.cell), (carry, activations)
 
     end, (before, activations) = lax.scan(token, carry, (projected, exists))
     return end, (input_kernel, recurrent_kernel, inputs, exists, before, activations)
 
 
-def _backward(residuals, gradient: Carry):
+def _backward(precision, residuals, gradient: Carry):
     input_kernel, recurrent_kernel, inputs, exists, before, activations = residuals
+    to_hidden = lax.optimization_barrier(recurrent_kernel.T)
 
     def token(gradient: Carry, x):
         there, cell_before, (i, f, g, o) = x
@@ -140,14 +166,16 @@ def _backward(residuals, gradient: Carry):
             ),
             axis=-1,
         )
-        return Carry(d_gates @ recurrent_kernel.T, d_cell * f), d_gates
+        return Carry(product(narrow(d_gates, precision), to_hidden), d_cell * f), d_gates
 
     start, d_gates = lax.scan(token, gradient, (exists, before.cell, activations), reverse=True)
+    d_bias = d_gates.sum(axis=(0, 1))
+    d_gates = narrow(d_gates, precision)
+    d_input_kernel = weight_gradient(inputs, d_gates)
+    d_recurrent_kernel = weight_gradient(narrow(before.hidden, precision), d_gates)
     flat = d_gates.reshape(-1, d_gates.shape[-1])
-    d_input_kernel = inputs.reshape(-1, inputs.shape[-1]).T @ flat
-    d_recurrent_kernel = before.hidden.reshape(-1, recurrent_kernel.shape[0]).T @ flat
-    d_inputs = (flat @ input_kernel.T).reshape(inputs.shape)
-    return d_input_kernel, d_recurrent_kernel, flat.sum(axis=0), d_inputs, None, start
+    d_inputs = product(flat, input_kernel.T).reshape(inputs.shape)
+    return d_input_kernel, d_recurrent_kernel, d_bias, d_inputs, None, start
 
 
 _lstm.defvjp(_forward, _backward)

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from rtd3jax.agents.lstm import Carry, init_lstm, lstm, zero_carry
+from rtd3jax.agents.products import matmul
 from rtd3jax.agents.variants import VARIANTS, NetworkSpec
 from rtd3jax.agents.windows import Steps, Window
 from rtd3jax.config import ALGORITHMS
@@ -53,7 +54,7 @@ def carry_before(params: Params, spec: NetworkSpec, window: Window) -> Carry:
     width = params["lstm"]["recurrent_kernel"].shape[0]
     start = zero_carry(window.length.shape[0], width)
     encoded = _encode(params, _past_tokens(spec, window))
-    return lstm(params["lstm"], encoded, window.exists, start)
+    return lstm(params["lstm"], encoded, window.exists, start, spec.precision)
 
 
 def apply_network(
@@ -78,8 +79,9 @@ def apply_network(
     if spec.current:
         current = _current_token(spec.current, window, action)
         features.append(jax.nn.relu(_linear(params["current"], current)))
-    hidden = jax.nn.relu(_linear(params["head"], jnp.concatenate(features, axis=-1)))
-    return _linear(params["output"], hidden)
+    head = params["head"]
+    hidden = matmul(jnp.concatenate(features, axis=-1), head["kernel"], spec.precision)
+    return _linear(params["output"], jax.nn.relu(hidden + head["bias"][None, :]))
 
 
 def count_parameters(
@@ -125,11 +127,12 @@ def _memory(
     current = _current_token(spec.memory, window, action)[None]
     present = jnp.ones((1, current.shape[1]), bool)
     if carry is not None:
-        return lstm(params["lstm"], _encode(params, current), present, carry).hidden
+        encoded = _encode(params, current)
+        return lstm(params["lstm"], encoded, present, carry, spec.precision).hidden
     tokens = jnp.concatenate((_past_tokens(spec, window), current))
     exists = jnp.concatenate((window.exists, present))
     start = zero_carry(current.shape[1], params["lstm"]["recurrent_kernel"].shape[0])
-    return lstm(params["lstm"], _encode(params, tokens), exists, start).hidden
+    return lstm(params["lstm"], _encode(params, tokens), exists, start, spec.precision).hidden
 
 
 def _past_tokens(spec: NetworkSpec, window: Window) -> jax.Array:
@@ -163,4 +166,5 @@ def _init_linear(key: jax.Array, inputs: int, outputs: int) -> Params:
 
 
 def _linear(params: Params, x: jax.Array) -> jax.Array:
+    # Always in float32: narrow inputs (an observation) cost little and would lose most.
     return x @ params["kernel"] + params["bias"][None, :]

@@ -32,6 +32,7 @@ class Hyperparameters:
     critic_learning_rate: jax.Array
     final_learning_rate_fraction: jax.Array
     gamma: jax.Array
+    reward_scale: jax.Array
     tau: jax.Array
     exploration_noise: jax.Array
     target_noise: jax.Array
@@ -127,7 +128,10 @@ def target(
     hyperparameters: Hyperparameters,
     bounds: Bounds,
 ) -> jax.Array:
-    """``y = r + gamma (1 - terminated) min_i Q'_i(next, smoothed target action)``: [B]."""
+    """``y = r + gamma (1 - terminated) min_i Q'_i(next, smoothed target action)``: [B].
+
+    ``r`` is the reward times ``reward_scale``.
+    """
     action = act(learner.target_actor, variant, batch.next_window, bounds)
     noise = hyperparameters.target_noise * jax.random.normal(key, action.shape, jnp.float32)
     clip = hyperparameters.target_noise_clip
@@ -138,7 +142,7 @@ def target(
         for critic in learner.target_critics
     )
     bootstrap = jnp.where(batch.terminated, 0.0, jnp.minimum(first, second))
-    return batch.reward + hyperparameters.gamma * bootstrap
+    return hyperparameters.reward_scale * batch.reward + hyperparameters.gamma * bootstrap
 
 
 def critic_loss(critics: Critics, variant: Variant, batch: Batch, y: jax.Array) -> jax.Array:

@@ -23,12 +23,14 @@ class NetworkSpec:
         current: parts of the input of the feed-forward stream; empty for none.
         carry_from_replay: whether the LSTM starts from the behaviour actor's stored carry instead
             of reading the past tokens itself (h-td3's critic).
+        precision: of its wide products' factors; see `rtd3jax.agents.products`.
     """
 
     memory: tuple[str, ...] = ()
     memory_has_current: bool = False
     current: tuple[str, ...] = ()
     carry_from_replay: bool = False
+    precision: str = "float32"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +44,13 @@ class Variant:
     def stores_carry(self) -> bool:
         """Whether replay keeps the behaviour actor's LSTM carries."""
         return self.critic.carry_from_replay
+
+    def at(self, precision: str) -> "Variant":
+        """The same agent with wide products in ``precision``."""
+        return Variant(
+            dataclasses.replace(self.actor, precision=precision),
+            dataclasses.replace(self.critic, precision=precision),
+        )
 
 
 _O = "observation"

@@ -15,14 +15,14 @@ from rtd3jax.envs.process import Process, float32, require, require_ordered
 from rtd3jax.errors import UserError
 
 
-def _mask(elements: tuple[int, ...], size: int) -> np.ndarray:
+def element_mask(elements: tuple[int, ...], size: int) -> np.ndarray:
     """Ones [O] at the disturbed elements, zeros elsewhere."""
     mask = np.zeros(size, np.float32)
     mask[list(elements)] = 1.0
     return mask
 
 
-def _check_elements(process: Any, elements: tuple[int, ...], size: int | None = None) -> None:
+def check_elements(process: Any, elements: tuple[int, ...], size: int | None = None) -> None:
     """Raise UserError unless the elements are distinct indices of an observation of ``size``."""
     name = type(process).__name__
     if not elements or len(set(elements)) != len(elements) or min(elements) < 0:
@@ -66,7 +66,7 @@ class Pulses(Process):
     length: int = struct.field(pytree_node=False, default=3)
     elements: tuple[int, ...] = struct.field(pytree_node=False, default=(0, 1))
 
-    def init(self, key: jax.Array, horizon: int | jax.Array) -> PulsesState:
+    def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> PulsesState:
         """All pulses to come."""
         zero = jnp.zeros((), jnp.int32)
         return PulsesState(
@@ -97,11 +97,11 @@ class Pulses(Process):
             running=jnp.maximum(running - 1, 0),
             amplitude=amplitude,
         )
-        return signal + _mask(self.elements, signal.shape[-1]) * offset, evolved
+        return signal + element_mask(self.elements, signal.shape[-1]) * offset, evolved
 
     def output_size(self, size: int) -> int:
         """Unchanged."""
-        _check_elements(self, self.elements, size)
+        check_elements(self, self.elements, size)
         return size
 
     def validate(self) -> None:
@@ -111,7 +111,7 @@ class Pulses(Process):
         require_ordered(self, "amplitude_min", "amplitude_max")
         require(self, "count", low=0)
         require(self, "length", low=1)
-        _check_elements(self, self.elements)
+        check_elements(self, self.elements)
 
 
 class SineState(struct.PyTreeNode):
@@ -142,7 +142,7 @@ class Sine(Process):
     elements: tuple[int, ...] = struct.field(pytree_node=False, default=(0, 1, 2))
     waves: int = struct.field(pytree_node=False, default=1)
 
-    def init(self, key: jax.Array, horizon: int | jax.Array) -> SineState:
+    def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> SineState:
         """Draw amplitude, period and start of every wave."""
         key_amplitude, key_period, key_start = jax.random.split(key, 3)
         shape = (self.waves,)
@@ -165,11 +165,11 @@ class Sine(Process):
         active = (elapsed >= 0.0) & (elapsed < state.period)
         offset = jnp.sum(jnp.where(active, wave, jnp.zeros_like(wave)))
         evolved = state.replace(time=state.time + 1)
-        return signal + _mask(self.elements, signal.shape[-1]) * offset, evolved
+        return signal + element_mask(self.elements, signal.shape[-1]) * offset, evolved
 
     def output_size(self, size: int) -> int:
         """Unchanged."""
-        _check_elements(self, self.elements, size)
+        check_elements(self, self.elements, size)
         return size
 
     def validate(self) -> None:
@@ -190,7 +190,7 @@ class DampedSine(Process):
     period_max: float = 100.0
     elements: tuple[int, ...] = struct.field(pytree_node=False, default=(0, 1, 2))
 
-    def init(self, key: jax.Array, horizon: int | jax.Array) -> SineState:
+    def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> SineState:
         """Draw amplitude, period and start of the one wave."""
         key_amplitude, key_period, key_start = jax.random.split(key, 3)
         start = jax.random.randint(key_start, (1,), 0, jnp.asarray(horizon, jnp.int32), jnp.int32)
@@ -209,11 +209,11 @@ class DampedSine(Process):
         cycles = elapsed / state.period
         offset = jnp.sum(state.amplitude * jnp.exp(-cycles) * jnp.sin(2.0 * jnp.pi * cycles))
         evolved = state.replace(time=state.time + 1)
-        return signal + _mask(self.elements, signal.shape[-1]) * offset, evolved
+        return signal + element_mask(self.elements, signal.shape[-1]) * offset, evolved
 
     def output_size(self, size: int) -> int:
         """Unchanged."""
-        _check_elements(self, self.elements, size)
+        check_elements(self, self.elements, size)
         return size
 
     def validate(self) -> None:
@@ -229,7 +229,7 @@ def _validate_wave(process: Sine | DampedSine) -> None:
     require(process, "period_min", above=0)
     require(process, "period_max", above=0)
     require_ordered(process, "period_min", "period_max")
-    _check_elements(process, process.elements)
+    check_elements(process, process.elements)
 
 
 class GaussianNoise(Process):
@@ -237,7 +237,7 @@ class GaussianNoise(Process):
 
     sigma: float = 0.5
 
-    def init(self, key: jax.Array, horizon: int | jax.Array) -> tuple[()]:
+    def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> tuple[()]:
         """No state: the noise is white."""
         return ()
 
@@ -256,7 +256,7 @@ class Hidden(Process):
 
     element: int = struct.field(pytree_node=False, default=2)
 
-    def init(self, key: jax.Array, horizon: int | jax.Array) -> tuple[()]:
+    def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> tuple[()]:
         """No state."""
         return ()
 
@@ -266,9 +266,9 @@ class Hidden(Process):
 
     def output_size(self, size: int) -> int:
         """One less."""
-        _check_elements(self, (self.element,), size)
+        check_elements(self, (self.element,), size)
         return size - 1
 
     def validate(self) -> None:
         """Check the element."""
-        _check_elements(self, (self.element,))
+        check_elements(self, (self.element,))

@@ -1,4 +1,4 @@
-"""An environment composed with a process that disturbs its observation (spec section 4)."""
+"""An environment whose observation, action or reward passes through a process (spec section 4)."""
 
 from typing import Any
 
@@ -8,17 +8,29 @@ from flax import struct
 from gymnax.environments import environment, spaces
 
 from rtd3jax.envs.identity import ValueIdentity, strong
-from rtd3jax.envs.process import Nothing, Process
+from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT, describe, foreign_code
+from rtd3jax.envs.process import Chain, Nothing, Process
 from rtd3jax.errors import UserError, nearest
 
 REWARDS_FROM = ("state", "observation")
+CHANNELS = {"observation": "process", "action": "action", "reward": "reward"}
+"""What can be disturbed, and the field of ``DisturbedParams`` that holds its process."""
+
+# Streams of the action's and the reward's processes, folded into the observation's key: far from
+# the small numbers by which processes fold and split it further.
+_ACTION_STREAM, _REWARD_STREAM = 0x61637400, 0x72657700
 
 
 class DisturbedParams(struct.PyTreeNode):
-    """Parameters of the environment below and of the process."""
+    """Parameters of the environment below and of the processes."""
 
     env: Any
     process: Process = Nothing()
+    """of the observation [O]"""
+    action: Process = Nothing()
+    """of the flat action [A], between the agent and the environment"""
+    reward: Process = Nothing()
+    """of the reward, as a signal [1]"""
 
     @property
     def max_steps_in_episode(self) -> int | jax.Array:
@@ -34,19 +46,28 @@ class DisturbedState(struct.PyTreeNode):
     env: Any
     """true state of the environment below"""
     process: Any
-    """state of the disturbance, reset with the episode"""
+    """state of the observation's disturbance, reset with the episode"""
+    action: Any
+    """state of the action's, likewise"""
+    reward: Any
+    """state of the reward's, likewise"""
     observation: jax.Array
     """float32 [O]: what the agent saw last"""
 
 
 class Disturbed(ValueIdentity, environment.Environment):
-    """``base`` with its observation passed through ``params.process``.
+    """``base`` with observation, action and reward passed through the processes of ``params``.
 
-    The process sees the first observation of an episode, then one more at every step, the final
-    one included; the observation after an automatic reset belongs to a newly drawn process. The
-    dynamics never see it. ``reward_from="observation"`` computes the reward from the observation
-    that the agent saw before it acted, the paper's ``noise`` case; ``info["true_reward"]`` is
-    always that of the true state, ``info["true_observation"]`` the undisturbed observation.
+    The observation's process sees the first observation of an episode, then one more at every step,
+    the final one included; the observation after an automatic reset belongs to a newly drawn
+    process. The dynamics never see it. The action's process changes what the dynamics receive, and
+    so whatever the reward charges for an action; the environment below limits it as it limits any
+    action.
+
+    ``reward_from="observation"`` computes the reward from the observation that the agent saw before
+    it acted, the paper's ``noise`` case; the reward's process acts after that.
+    ``info["true_reward"]`` is always that of the true state, ``info["true_observation"]`` the
+    undisturbed observation.
     """
 
     def __init__(
@@ -81,9 +102,8 @@ class Disturbed(ValueIdentity, environment.Environment):
             return self._default_params
         return DisturbedParams(env=self.base.default_params)
 
-    def _size(self, params: DisturbedParams) -> int:
-        """Elements of the observation; raises UserError if the process does not fit it."""
-        full = self.base.observation_space(params.env).shape[0]
+    def _size(self, params: DisturbedParams, full: int) -> int:
+        """Elements seen of ``full``; raises UserError if a process does not fit its signal."""
         size = params.process.output_size(full)
         if self.reward_from == "observation" and size != full:
             raise UserError(
@@ -96,14 +116,26 @@ class Disturbed(ValueIdentity, environment.Environment):
     def reset_env(
         self, key: jax.Array, params: DisturbedParams
     ) -> tuple[jax.Array, DisturbedState]:
-        """Start an episode of both; returns the first observation [O]."""
-        self._size(params)
+        """Start an episode of all; returns the first observation [O]."""
         key_env, key_init, key_process = jax.random.split(key, 3)
-        true_observation, env = self.base.reset_env(key_env, params.env)
-        process = params.process.init(key_init, params.max_steps_in_episode)
+        with foreign_code():
+            true_observation, env = self.base.reset_env(key_env, params.env)
+            actions = _action_size(self.base, params.env)
+        true_observation = jnp.asarray(true_observation, jnp.float32)
+        (full,) = true_observation.shape
+        self._size(params, full)
+        horizon = getattr(params, "max_steps_in_episode", DEFAULT_STEP_LIMIT)
+        process = params.process.init(key_init, horizon, full)
         observation, process = params.process.step(key_process, process, true_observation)
         state = DisturbedState(
-            time=jnp.zeros((), jnp.int32), env=env, process=process, observation=observation
+            time=jnp.zeros((), jnp.int32),
+            env=env,
+            process=process,
+            action=params.action.init(
+                jax.random.fold_in(key_init, _ACTION_STREAM), horizon, actions
+            ),
+            reward=params.reward.init(jax.random.fold_in(key_init, _REWARD_STREAM), horizon, 1),
+            observation=observation,
         )
         return observation, strong(state)
 
@@ -114,20 +146,37 @@ class Disturbed(ValueIdentity, environment.Environment):
         action: Any,
         params: DisturbedParams,
     ) -> tuple[jax.Array, DisturbedState, jax.Array, jax.Array, dict[Any, Any]]:
-        """One step of both; the observation [O] belongs to the episode even if it is its last."""
+        """One step of all; the observation [O] belongs to the episode even if it is its last."""
         key_env, key_process = jax.random.split(key)
-        true_observation, env, true_reward, terminated, info = self.base.step_env(
-            key_env, state.env, action, params.env
-        )
-        reward = true_reward
+        key_action = jax.random.fold_in(key_process, _ACTION_STREAM)
+        key_reward = jax.random.fold_in(key_process, _REWARD_STREAM)
+        action = jnp.asarray(action, jnp.float32)
+        applied, action_state = params.action.step(key_action, state.action, action.reshape(-1))
+        applied = applied.reshape(action.shape)
+        with foreign_code():
+            true_observation, env, below, terminated, info = self.base.step_env(
+                key_env, state.env, applied, params.env
+            )
+        true_observation = jnp.asarray(true_observation, jnp.float32)
+        reward = below = jnp.asarray(below, jnp.float32)
         if self.reward_from == "observation":
-            reward = self.base.observed_reward(state.observation, action, params.env)
+            reward = self.base.observed_reward(state.observation, applied, params.env)
+        reward, reward_state = params.reward.step(key_reward, state.reward, reward.reshape(1))
         observation, process = params.process.step(key_process, state.process, true_observation)
         evolved = DisturbedState(
-            time=state.time + 1, env=env, process=process, observation=observation
+            time=state.time + 1,
+            env=env,
+            process=process,
+            action=action_state,
+            reward=reward_state,
+            observation=observation,
         )
-        info = {**info, "true_reward": true_reward, "true_observation": true_observation}
-        return observation, strong(evolved), reward, terminated, info
+        info = {
+            **info,
+            "true_reward": info.get("true_reward", below),
+            "true_observation": true_observation,
+        }
+        return observation, strong(evolved), reward.reshape(()), terminated, info
 
     def is_terminated(self, state: DisturbedState, params: DisturbedParams) -> jax.Array:
         """Whether the environment below ended by itself."""
@@ -135,7 +184,8 @@ class Disturbed(ValueIdentity, environment.Environment):
 
     def is_truncated(self, state: DisturbedState, params: DisturbedParams) -> jax.Array:
         """Whether the environment below reached its time limit."""
-        return self.base.is_truncated(state.env, params.env)
+        with foreign_code():
+            return self.base.is_truncated(state.env, params.env)
 
     @property
     def name(self) -> str:
@@ -153,5 +203,91 @@ class Disturbed(ValueIdentity, environment.Environment):
 
     def observation_space(self, params: DisturbedParams | None = None) -> spaces.Box:
         """Unbounded: a disturbance may leave the bounds of the environment below."""
-        size = self._size(self.default_params if params is None else params)
+        params = self.default_params if params is None else params
+        size = self._size(params, _observation_size(self.base, params.env))
         return spaces.Box(-jnp.inf, jnp.inf, (size,), jnp.float32)
+
+
+def disturb(env: Any, process: Process, channel: str = "observation", *, params: Any = None) -> Any:
+    """``env`` with one channel passed through ``process``, which is drawn anew every episode.
+
+    Call it again for further channels or processes: those of one channel act in the order in which
+    they were added.
+
+    Args:
+        env: a gymnax >= 1.0 environment with a flat observation and a bounded Box of actions.
+        process: of a signal [O] (observation), [A] (flat action, in the environment's units) or
+            [1] (reward).
+        channel: "observation", "action" or "reward".
+        params: the environment's parameters; its own by default. They and the process become the
+            ``default_params`` of what is returned.
+
+    Raises:
+        UserError: for a process that does not fit, or an environment that cannot be composed.
+    """
+    if channel not in CHANNELS:
+        raise UserError(
+            f"channel {channel!r} must be one of {', '.join(CHANNELS)}"
+            f"{nearest(str(channel), CHANNELS)}"
+        )
+    if not isinstance(process, Process):
+        raise UserError(
+            f"{process!r} is not a process: make one of rtd.Dropout, rtd.Delay, ..., "
+            "or inherit from rtd.Process"
+        )
+    process.validate()
+    for method in ("reset_env", "step_env", "is_truncated"):
+        if not callable(getattr(env, method, None)):
+            raise UserError(
+                f"{type(env).__name__} has no {method}, without which a disturbance cannot be "
+                "composed with its episodes: inherit from gymnax's Environment"
+            )
+    params = env.default_params if params is None else params
+    if not isinstance(env, Disturbed):
+        describe(env, params)
+        env, params = Disturbed(env), DisturbedParams(env=params)
+    field = CHANNELS[channel]
+    params = params.replace(**{field: sequence(getattr(params, field), process)})
+    disturbed = Disturbed(env.base, env.reward_from, params)
+    check_fit(disturbed)
+    return disturbed
+
+
+def sequence(*processes: Process) -> Process:
+    """The processes one after the other, as flat as can be."""
+    flat: list[Process] = []
+    for process in processes:
+        if not isinstance(process, Nothing):
+            flat += process.processes if isinstance(process, Chain) else [process]
+    return Chain(tuple(flat)) if len(flat) > 1 else flat[0] if flat else Nothing()
+
+
+def check_fit(env: Disturbed) -> None:
+    """Raise UserError if a process of the default parameters does not fit its channel."""
+    params = env.default_params
+    env.observation_space(params)
+    with foreign_code():
+        actions = _action_size(env.base, params.env)
+    for what, process, size in (("action", params.action, actions), ("reward", params.reward, 1)):
+        if process.output_size(size) != size:
+            raise UserError(
+                f"{type(process).__name__} changes the number of elements, "
+                f"which the {what} does not allow"
+            )
+
+
+def _action_size(base: Any, params: Any) -> int:
+    size = 1
+    for length in base.action_space(params).shape:
+        size *= length
+    return size
+
+
+def _observation_size(base: Any, params: Any) -> int:
+    """Elements of the undisturbed observation; many environments declare no space."""
+    with foreign_code():
+        try:
+            return base.observation_space(params).shape[0]
+        except (AttributeError, NotImplementedError):
+            key = jax.eval_shape(lambda: jax.random.key(0))
+            return jax.eval_shape(base.reset_env, key, params)[0].shape[0]

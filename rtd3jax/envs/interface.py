@@ -11,6 +11,9 @@ import numpy as np
 
 from rtd3jax.errors import UserError
 
+DEFAULT_STEP_LIMIT = 10_000
+"""Steps after which an episode is cut where the environment names no time limit of its own."""
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Interface:
@@ -32,37 +35,97 @@ def foreign_code() -> Iterator[None]:
         yield
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Survey:
+    """What tracing an environment shows. What could not be found out is None."""
+
+    interface: Interface | None
+    problems: list[UserError]
+    """The worst first; with any of them the environment cannot be learned."""
+    reset: tuple[Any, Any] | None
+    """Shapes of (observation, state)."""
+    step: tuple | None
+    """Shapes of the six values."""
+
+
 def describe(env: Any, params: Any) -> Interface:
     """Check that ``env`` is a gymnax >= 1.0 environment that can be learned, and measure it.
 
     The environment is traced, not compiled. Whatever is wrong is a UserError with the remedy.
     """
-    name = _name(env)
+    found = survey(env, params)
+    if found.problems:
+        raise found.problems[0]
+    assert found.interface is not None
+    return found.interface
+
+
+def survey(env: Any, params: Any) -> Survey:
+    """All that `describe` can find wrong, and the shapes that it saw."""
+    name = environment_name(env)
     for method in ("reset", "step", "action_space"):
         if not callable(getattr(env, method, None)):
-            raise UserError(
+            error = UserError(
                 f"environment {name} has no method {method}: it is not a gymnax environment "
                 "(gymnax >= 1.0: reset(key, params), step(key, state, action, params), "
                 "action_space(params))"
             )
+            return Survey(None, [error], None, None)
+    problems: list[UserError] = []
+
+    def noted(call: Callable[[], Any]) -> Any:
+        """The call's result, or None for one whose error was noted."""
+        try:
+            return call()
+        except UserError as error:
+            problems.append(error)
+            return None
+
     with foreign_code():
-        shape, low, high = _bounds(env, params, name)
-        key = jax.eval_shape(lambda: jax.random.key(0))
+        bounds = noted(lambda: _bounds(env, params, name))
+        first = noted(lambda: trace_reset(env, params))
+        if first is not None:
+            noted(lambda: _check_observation(name, "reset", first[0]))
+        if bounds is None or problems:
+            return Survey(None, problems, first, None)
+        shape, low, high = bounds
+        after = noted(
+            lambda: trace_step(env, params, first[1], jax.ShapeDtypeStruct(shape, jnp.float32))
+        )
+    if after is None:
+        return Survey(None, problems, first, None)
+    problems += _step_problems(name, after, first[0])
+    size = first[0].shape[0]
+    return Survey(Interface(size, shape, low.size, low, high), problems, first, after)
+
+
+def trace_reset(env: Any, params: Any) -> tuple[Any, Any]:
+    """Shapes of the two values of reset; UserError if it fails or gives others."""
+    name, key = environment_name(env), jax.eval_shape(lambda: jax.random.key(0))
+    with foreign_code():
         first = _attempt(name, "reset", lambda: jax.eval_shape(env.reset, key, params))
-        if not isinstance(first, tuple) or len(first) != 2:
-            raise UserError(f"environment {name}: reset must return (observation, state)")
-        observation, state = first
-        _check_observation(name, "reset", observation)
-        action = jax.ShapeDtypeStruct(shape, jnp.float32)
+    if not isinstance(first, tuple) or len(first) != 2:
+        raise UserError(f"environment {name}: reset must return (observation, state)")
+    return first
+
+
+def trace_step(env: Any, params: Any, state: Any, action: Any) -> tuple:
+    """Shapes of the six values of step; UserError if it fails or gives another number."""
+    name, key = environment_name(env), jax.eval_shape(lambda: jax.random.key(0))
+    with foreign_code():
         after = _attempt(name, "step", lambda: jax.eval_shape(env.step, key, state, action, params))
-    _check_step(name, after, observation)
-    return Interface(
-        observation_size=observation.shape[0],
-        action_shape=shape,
-        action_size=low.size,
-        action_low=low,
-        action_high=high,
-    )
+    count = len(after) if isinstance(after, tuple) else 1
+    if count == 5:
+        raise UserError(
+            f"environment {name}: step returns five values, as before gymnax 1.0; upgrade it to "
+            "return (observation, state, reward, terminated, truncated, info)"
+        )
+    if count != 6:
+        raise UserError(
+            f"environment {name}: step returns {count} values instead of the six of gymnax >= 1.0 "
+            "(observation, state, reward, terminated, truncated, info)"
+        )
+    return after
 
 
 def action_bounds(env: Any, params: Any) -> tuple[jax.Array, jax.Array]:
@@ -76,7 +139,8 @@ def action_bounds(env: Any, params: Any) -> tuple[jax.Array, jax.Array]:
     return low, high
 
 
-def _name(env: Any) -> str:
+def environment_name(env: Any) -> str:
+    """The name used in messages."""
     try:
         return str(env.name)
     except Exception:  # a name is for messages only, so a broken one must not hide the message
@@ -138,32 +202,33 @@ def _check_observation(name: str, what: str, observation: Any) -> None:
         )
 
 
-def _check_step(name: str, after: Any, first_observation: Any) -> None:
-    """Raise UserError unless ``after`` has the six values of gymnax >= 1.0."""
-    count = len(after) if isinstance(after, tuple) else 1
-    if count == 5:
-        raise UserError(
-            f"environment {name}: step returns five values, as before gymnax 1.0; upgrade it to "
-            "return (observation, state, reward, terminated, truncated, info)"
-        )
-    if count != 6:
-        raise UserError(
-            f"environment {name}: step returns {count} values instead of the six of gymnax >= 1.0 "
-            "(observation, state, reward, terminated, truncated, info)"
-        )
+def _step_problems(name: str, after: tuple, first_observation: Any) -> Iterator[UserError]:
+    """What is wrong with the six values of step."""
     observation, _, reward, terminated, truncated, info = after
-    _check_observation(name, "step", observation)
+    try:
+        _check_observation(name, "step", observation)
+    except UserError as error:
+        yield error
+        return
     if observation.shape != first_observation.shape:
-        raise UserError(
+        yield UserError(
             f"environment {name}: observations of step and reset have shapes "
             f"{observation.shape} and {first_observation.shape}; make them the same"
         )
     for what, value in (("reward", reward), ("terminated", terminated), ("truncated", truncated)):
         if getattr(value, "shape", None) != ():
-            raise UserError(
+            yield UserError(
                 f"environment {name}: {what} must be a scalar, not of shape "
-                f"{getattr(value, 'shape', type(value).__name__)}"
+                f"{getattr(value, 'shape', type(value).__name__)}; return one number per step"
             )
+    try:
+        check_final_observation(name, info, observation)
+    except UserError as error:
+        yield error
+
+
+def check_final_observation(name: str, info: Any, observation: Any) -> None:
+    """Raise UserError unless ``info`` has the observation before the automatic reset."""
     if not isinstance(info, dict) or "final_observation" not in info:
         raise UserError(
             f"environment {name}: info lacks 'final_observation', the observation before the "

@@ -17,8 +17,8 @@ from rtd3jax.errors import UserError
 class Process(struct.PyTreeNode):
     """Base of every process. ``signal`` is a float vector, [O] observations or [2] wheel speeds."""
 
-    def init(self, key: jax.Array, horizon: int | jax.Array) -> Any:
-        """Draw the state of an episode of ``horizon`` steps (which may be traced)."""
+    def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> Any:
+        """Draw the state of an episode of ``horizon`` steps (may be traced), signals [size]."""
         raise NotImplementedError
 
     def step(self, key: jax.Array, state: Any, signal: jax.Array) -> tuple[jax.Array, Any]:
@@ -36,7 +36,7 @@ class Process(struct.PyTreeNode):
 class Nothing(Process):
     """Leaves the signal as it is."""
 
-    def init(self, key: jax.Array, horizon: int | jax.Array) -> tuple[()]:
+    def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> tuple[()]:
         """No state."""
         return ()
 
@@ -46,16 +46,17 @@ class Nothing(Process):
 
 
 class Chain(Process):
-    """Several processes, the first acting first, each with its own random stream."""
+    """Several processes in sequence, the first acting first, each with its own random stream."""
 
     processes: tuple[Process, ...] = ()
 
-    def init(self, key: jax.Array, horizon: int | jax.Array) -> tuple:
+    def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> tuple:
         """The tuple of the members' states."""
-        return tuple(
-            process.init(jax.random.fold_in(key, index), horizon)
-            for index, process in enumerate(self.processes)
-        )
+        states = []
+        for index, process in enumerate(self.processes):
+            states.append(process.init(jax.random.fold_in(key, index), horizon, size))
+            size = process.output_size(size)
+        return tuple(states)
 
     def step(self, key: jax.Array, state: tuple, signal: jax.Array) -> tuple[jax.Array, tuple]:
         """Pass the signal through the members in order."""
@@ -69,6 +70,47 @@ class Chain(Process):
         """The size after the last member."""
         for process in self.processes:
             size = process.output_size(size)
+        return size
+
+    def validate(self) -> None:
+        """Validate every member."""
+        for process in self.processes:
+            process.validate()
+
+
+class Sum(Process):
+    """Several processes side by side: each sees the clean signal, and what they add is added up.
+
+    Each has its own random stream. In a `Chain` a later member sees what the earlier ones made of
+    the signal; here none sees another's work, and their order does not matter.
+    """
+
+    processes: tuple[Process, ...] = ()
+
+    def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> tuple:
+        """The tuple of the members' states."""
+        return tuple(
+            process.init(jax.random.fold_in(key, index), horizon, size)
+            for index, process in enumerate(self.processes)
+        )
+
+    def step(self, key: jax.Array, state: tuple, signal: jax.Array) -> tuple[jax.Array, tuple]:
+        """Add every member's offset to the signal."""
+        total, states = signal, []
+        for index, (process, inner) in enumerate(zip(self.processes, state, strict=True)):
+            disturbed, inner = process.step(jax.random.fold_in(key, index), inner, signal)
+            total = total + (disturbed - signal)
+            states.append(inner)
+        return total, tuple(states)
+
+    def output_size(self, size: int) -> int:
+        """Unchanged; UserError for a member that adds or removes elements."""
+        for process in self.processes:
+            if process.output_size(size) != size:
+                raise UserError(
+                    f"Sum: {type(process).__name__} changes the number of elements, so that what "
+                    "it adds is not defined; put it into a Chain"
+                )
         return size
 
     def validate(self) -> None:

@@ -11,7 +11,15 @@ from typing import Any
 import gymnax
 
 from rtd3jax.envs.disturbances import DampedSine, GaussianNoise, Hidden, Pulses, Sine
-from rtd3jax.envs.disturbed import Disturbed, DisturbedParams
+from rtd3jax.envs.disturbed import (
+    CHANNELS,
+    Disturbed,
+    DisturbedParams,
+    check_fit,
+    disturb,
+    sequence,
+)
+from rtd3jax.envs.faults import Delay, Dropout, GainDrift, OrnsteinUhlenbeck, Quantisation
 from rtd3jax.envs.identity import ValueIdentity, strong, with_identity
 from rtd3jax.envs.interface import foreign_code
 from rtd3jax.envs.pendulum import Pendulum
@@ -47,49 +55,104 @@ _PROCESSES: dict[str, dict[str, Process]] = {
     },
 }
 
-ENVIRONMENTS: tuple[str, ...] = tuple(_PROCESSES)
-"""The paper's worlds. Every gymnax id can be made too, undisturbed."""
+_OWN_CHANNEL = {"pendulum": "observation", "rover": "slip"}
+"""Where a world's own processes act."""
 
-DISTURBANCES: dict[str, tuple[str, ...]] = {env: tuple(ids) for env, ids in _PROCESSES.items()}
-"""The disturbances of each world (spec sections 3 and 4)."""
+_FAULTS: dict[str, tuple[str, Process]] = {
+    "dropout": ("observation", Dropout()),
+    "delay": ("observation", Delay()),
+    "quantisation": ("observation", Quantisation()),
+    "ornstein-uhlenbeck": ("observation", OrnsteinUhlenbeck()),
+    "action-delay": ("action", Delay()),
+    "gain-drift": ("action", GainDrift()),
+}
+
+FAULTS: tuple[str, ...] = tuple(_FAULTS)
+"""The disturbances that fit any world, a gymnax id included; not the paper's."""
+
+ENVIRONMENTS: tuple[str, ...] = tuple(_PROCESSES)
+"""The paper's worlds. Every gymnax id can be made too."""
+
+DISTURBANCES: dict[str, tuple[str, ...]] = {
+    env: (*ids, *_FAULTS) for env, ids in _PROCESSES.items()
+}
+"""The disturbances of each world: its own (spec sections 3 and 4), then ``FAULTS``. They can be
+joined by ``+``: ``ar1-slip+dropout``."""
 
 _constructors: dict[str, Callable[..., Any]] = {}
+_registered: dict[str, tuple[Any, dict[str, tuple[str, Process]]]] = {}
 
 
 def make(env_id: str, disturbance: str = "none", **parameters: Any) -> Any:
     """Make an environment whose ``default_params`` carry the disturbance and the parameters.
 
-    A parameter is a field of the disturbance, else of the environment's parameters; the pendulum
-    also has ``reward_from`` ("state" or "observation"; the default is "observation" for ``noise``
-    alone, as the paper has it [choice]). ``env_id`` is one of ``ENVIRONMENTS``, a registered id, or
-    a gymnax id.
+    ``disturbance`` is an id, or several joined by ``+``, of which those that disturb the same thing
+    act in that order. A parameter is a field of a disturbance, else of the environment's
+    parameters; the pendulum also has ``reward_from`` ("state" or "observation"; the default is
+    "observation" for ``noise`` alone, as the paper has it [choice]). ``env_id`` is one of
+    ``ENVIRONMENTS``, a registered id, or a gymnax id.
     """
     if env_id in _constructors:
         return _constructors[env_id](disturbance, **parameters)
-    if env_id in _PROCESSES:
-        process = _lookup(env_id, disturbance)
-        return (
-            _make_pendulum(disturbance, process, parameters)
-            if env_id == "pendulum"
-            else (_make_rover(disturbance, process, parameters))
-        )
-    if env_id in gymnax.registered_envs:
-        if disturbance != "none":
-            raise UserError(f"environment {env_id} has no disturbance {disturbance!r}, only 'none'")
-        return _make_gymnax(env_id, parameters)
-    known = (*ENVIRONMENTS, *_constructors, *gymnax.registered_envs)
+    if env_id in _registered:
+        return _disturbed(env_id, _registered[env_id][0], disturbance, parameters)
+    if env_id in _PROCESSES or env_id in gymnax.registered_envs:
+        base = {"pendulum": Pendulum, "rover": Rover}.get(env_id, lambda: _make_gymnax(env_id))()
+        return _disturbed(env_id, base, disturbance, parameters)
+    known = (*ENVIRONMENTS, *_constructors, *_registered, *gymnax.registered_envs)
     raise UserError(f"unknown environment {env_id!r}{nearest(env_id, known)}")
 
 
-def register(env_id: str, constructor: Callable[..., Any]) -> None:
-    """Let ``make(env_id, disturbance, **parameters)`` call ``constructor`` with the latter two."""
+def register(
+    env_id: str,
+    world: Any,
+    disturbances: dict[str, Process | tuple[str, Process]] | None = None,
+) -> None:
+    """Let ``make`` and the sweep know a world by name.
+
+    Args:
+        env_id: a new id.
+        world: a gymnax >= 1.0 environment, to which ``make`` then gives parameters and disturbances
+            as it does to ours; or a function ``(disturbance, **parameters)`` that returns one and
+            sees to both itself.
+        disturbances: of an environment, beside "none" and ``FAULTS``: the name of each, and its
+            process of the observation or its (channel, process), as `disturb` takes them.
+
+    Raises:
+        UserError: for an id or a name that is taken, or what is no world.
+    """
     if not isinstance(env_id, str) or not env_id:
         raise UserError(f"an environment id must be a non-empty string, not {env_id!r}")
-    if not callable(constructor):
-        raise UserError(f"the constructor of {env_id!r} is not callable")
-    if env_id in _constructors or env_id in _PROCESSES or env_id in gymnax.registered_envs:
+    is_environment = callable(getattr(world, "reset", None)) and callable(
+        getattr(world, "step", None)
+    )
+    if isinstance(world, type) or not (is_environment or callable(world)):
+        raise UserError(f"the world {env_id!r} must be an environment or a function, not {world!r}")
+    if env_id in {*_constructors, *_registered, *_PROCESSES} or env_id in gymnax.registered_envs:
         raise UserError(f"environment {env_id!r} exists already; choose another id")
-    _constructors[env_id] = constructor
+    if is_environment:
+        _registered[env_id] = world, _named_processes(env_id, world, disturbances or {})
+    elif disturbances is not None:
+        raise UserError(f"{env_id!r}: disturbances are for an environment, not for a function")
+    else:
+        _constructors[env_id] = world
+
+
+def _named_processes(
+    env_id: str, world: Any, disturbances: dict[str, Any]
+) -> dict[str, tuple[str, Process]]:
+    """Channel and process of each name, each tried on the world."""
+    named: dict[str, tuple[str, Process]] = {"none": ("observation", Nothing())}
+    for name, value in disturbances.items():
+        if not re.fullmatch(r"[\w.-]+", name) or name in (*named, *_FAULTS):
+            raise UserError(
+                f"{env_id!r}: a disturbance cannot be called {name!r}; choose another name of "
+                "letters, digits, '-', '.' and '_'"
+            )
+        channel, process = value if isinstance(value, tuple) else ("observation", value)
+        disturb(world, process, channel)
+        named[name] = channel, process
+    return named
 
 
 def parse_disturbance(text: str) -> tuple[str, dict[str, Any]]:
@@ -115,42 +178,84 @@ def parse_disturbance(text: str) -> tuple[str, dict[str, Any]]:
     return disturbance.strip(), parameters
 
 
-def _lookup(env_id: str, disturbance: str) -> Process:
-    processes = _PROCESSES[env_id]
-    if disturbance not in processes:
-        raise UserError(
-            f"unknown disturbance {disturbance!r} of {env_id}{nearest(disturbance, processes)} "
-            f"(known: {', '.join(processes)})"
-        )
-    return processes[disturbance]
+def _known(env_id: str) -> dict[str, tuple[str, Process]]:
+    """Channel and process of every disturbance of a world, by name."""
+    if env_id in _registered:
+        own = _registered[env_id][1]
+    else:
+        processes = _PROCESSES.get(env_id, {"none": Nothing()})
+        channel = _OWN_CHANNEL.get(env_id, "observation")
+        own = {name: (channel, process) for name, process in processes.items()}
+    return {**own, **_FAULTS}
 
 
-def _make_pendulum(disturbance: str, process: Process, parameters: dict[str, Any]) -> Disturbed:
-    rest = dict(parameters)
-    reward_from = rest.pop("reward_from", "observation" if disturbance == "noise" else "state")
-    base = Pendulum()
-    what = f"pendulum with {disturbance}"
-    process, env_params = _assign(what, (process, base.default_params), rest, ("reward_from",))
-    for name in ("max_speed", "max_torque", "dt", "m", "l"):
-        require(env_params, name, above=0)
-    _validate(process, env_params)
-    env = Disturbed(base, reward_from, DisturbedParams(env=env_params, process=process))
-    env.observation_space()  # raises now if the process does not fit the observation
+def _lookup(env_id: str, disturbance: str) -> list[tuple[str, Process]]:
+    """Channel and process of each part of ``disturbance``."""
+    known = _known(env_id)
+    for name in disturbance.split("+"):
+        if name not in known:
+            raise UserError(
+                f"unknown disturbance {name!r} of {env_id}{nearest(name, known)} "
+                f"(known: {', '.join(known)})"
+            )
+    return [known[name] for name in disturbance.split("+")]
+
+
+def _disturbed(env_id: str, base: Any, disturbance: str, parameters: dict[str, Any]) -> Any:
+    """``base`` with the named disturbance, and ``parameters`` shared out among them."""
+    names = disturbance.split("+")
+    channels, processes = zip(*_lookup(env_id, disturbance), strict=True)
+    rest, reward_from = dict(parameters), "state"
+    also: tuple[str, ...] = ()
+    if env_id == "pendulum":
+        reward_from = rest.pop("reward_from", "observation" if "noise" in names else "state")
+        also = ("reward_from",)
+    what = f"{env_id} with {disturbance}"
+    _check_owners(what, names, processes, rest)
+    assigned = _assign(what, (*processes, base.default_params), rest, also)
+    processes, params = assigned[:-1], assigned[-1]
+    for process in processes:
+        process.validate()
+    for name in _POSITIVE.get(env_id, ()):
+        require(params, name, above=0)
+    if hasattr(params, "max_steps_in_episode"):
+        require(params, "max_steps_in_episode", low=1)
+
+    def on(channel: str) -> Process:
+        return sequence(*(p for p, c in zip(processes, channels, strict=True) if c == channel))
+
+    if env_id == "rover":
+        params = params.replace(slip=on("slip"))
+        base = Rover(params)
+    elif env_id in gymnax.registered_envs:
+        base = _make_gymnax(env_id, params)
+    bare = env_id == "rover" or env_id in gymnax.registered_envs
+    if bare and all(isinstance(on(channel), Nothing) for channel in CHANNELS):
+        return base
+    fields = {field: on(channel) for channel, field in CHANNELS.items()}
+    env = Disturbed(base, reward_from, DisturbedParams(env=params, **fields))
+    check_fit(env)
     return env
 
 
-def _make_rover(disturbance: str, process: Process, parameters: dict[str, Any]) -> Rover:
-    what = f"rover with {disturbance}"
-    process, params = _assign(what, (process, Rover().default_params), parameters)
-    for name in ("wheelbase", "max_speed", "max_yaw_rate"):
-        require(params, name, above=0)
-    _validate(process, params)
-    return Rover(params.replace(slip=process))
+_POSITIVE = {
+    "pendulum": ("max_speed", "max_torque", "dt", "m", "l"),
+    "rover": ("wheelbase", "max_speed", "max_yaw_rate"),
+}
+"""Parameters that must be greater than zero."""
 
 
-def _validate(process: Process, params: Any) -> None:
-    process.validate()
-    require(params, "max_steps_in_episode", low=1)
+def _check_owners(
+    what: str, names: list[str], processes: tuple[Process, ...], parameters: dict[str, Any]
+) -> None:
+    """Raise UserError for a parameter that several of the joined disturbances have."""
+    for name in parameters:
+        owners = [n for n, p in zip(names, processes, strict=True) if name in _settable(p)]
+        if len(owners) > 1:
+            raise UserError(
+                f"{what}: {name!r} could be that of {' or '.join(owners)}; "
+                "join such disturbances with rtd.disturb"
+            )
 
 
 class _Preset(ValueIdentity):
@@ -184,17 +289,16 @@ class _Preset(ValueIdentity):
         return observation, strong(state)
 
 
-def _make_gymnax(env_id: str, parameters: dict[str, Any]) -> Any:
+def _make_gymnax(env_id: str, params: Any = None) -> Any:
+    """gymnax's environment with ``params`` for its defaults; None means gymnax's own."""
     try:
-        base, params = gymnax.make(env_id)
+        base, defaults = gymnax.make(env_id)
     except Exception as error:
         raise UserError(
             f"environment {env_id} cannot be made: {type(error).__name__}: {error}"
         ) from error
-    (params,) = _assign(env_id, (params,), parameters)
-    if hasattr(params, "max_steps_in_episode"):
-        require(params, "max_steps_in_episode", low=1)
     env: Any = object.__new__(with_identity(_Preset, type(base)))  # type: ignore[arg-type]
+    params = defaults if params is None else params
     env.__dict__.update(vars(base), _preset_id=env_id, _preset_params=params)
     return env
 
@@ -219,11 +323,16 @@ def _assign(
                 f"{what} has no parameter {name!r}{nearest(name, known)} "
                 f"(known: {', '.join(known)})"
             )
-    return tuple(o.replace(**change) for o, change in zip(owners, changes, strict=True))
+    return tuple(
+        owner.replace(**change) if change else owner
+        for owner, change in zip(owners, changes, strict=True)
+    )
 
 
 def _settable(owner: Any) -> dict[str, Any]:
     """The fields that a plain value can set, with their defaults."""
+    if not dataclasses.is_dataclass(owner):  # others' parameters can be anything
+        return {}
     values = {field.name: getattr(owner, field.name) for field in dataclasses.fields(owner)}
     return {name: v for name, v in values.items() if isinstance(v, bool | int | float | tuple)}
 

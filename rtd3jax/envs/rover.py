@@ -13,6 +13,7 @@ from gymnax.environments import environment, spaces
 
 from rtd3jax.envs.identity import ValueIdentity, strong
 from rtd3jax.envs.process import Nothing, Process, float32
+from rtd3jax.envs.slip import WHEELS
 
 
 class RoverParams(struct.PyTreeNode):
@@ -64,7 +65,7 @@ class Rover(ValueIdentity, environment.Environment):
             time=jnp.zeros((), jnp.int32),
             speed=jnp.zeros((), jnp.float32),
             yaw_rate=jnp.zeros((), jnp.float32),
-            slip=params.slip.init(key, params.max_steps_in_episode),
+            slip=params.slip.init(key, params.max_steps_in_episode, WHEELS),
         )
         return _errors(state, params), strong(state)
 

@@ -28,7 +28,7 @@ class Ar1Slip(Process):
     sigma: float = 0.05
     max_slip: float = 0.5
 
-    def init(self, key: jax.Array, horizon: int | jax.Array) -> Ar1SlipState:
+    def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> Ar1SlipState:
         """Draw the initial slip."""
         draw = jax.random.uniform(key, (WHEELS,), jnp.float32)
         return Ar1SlipState(slip=float32(self.max_slip) * draw)
@@ -77,7 +77,7 @@ class SineSlip(Process):
     offset: float = 0.12
     max_slip: float = 0.5
 
-    def init(self, key: jax.Array, horizon: int | jax.Array) -> SineSlipState:
+    def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> SineSlipState:
         """Draw the waves."""
         key_amplitude, key_period, key_phase = jax.random.split(key, 3)
         shape = (WHEELS,)

@@ -7,13 +7,13 @@ import warnings
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-import jax
 import numpy as np
 
 from rtd3jax.agents.variants import VARIANTS
 from rtd3jax.config import Config
 from rtd3jax.envs.registry import make, parse_disturbance
 from rtd3jax.errors import UserError
+from rtd3jax.study.memory import job_bytes
 from rtd3jax.training.lanes import Job
 from rtd3jax.training.run import make_jobs
 
@@ -128,18 +128,21 @@ class Cost:
 
     Attributes:
         programs: to compile.
-        lane_bytes: of the largest lane's state.
+        state_bytes: of the largest lane's state.
+        working_bytes: that the largest lane needs besides while it advances.
         seconds: of computing, without compiling; a rough figure from operation counts.
     """
 
     programs: int
-    lane_bytes: int
+    state_bytes: int
+    working_bytes: int
     seconds: float
 
 
 def estimate(jobs: Sequence[Job], workers: int) -> Cost:
-    """Count programs, measure lane states from their shapes, and time from operation counts."""
-    sizes = lane_bytes(jobs)
+    """Count programs, bytes from shapes, and time from operation counts."""
+    sizes = job_bytes(jobs)
+    state, work = (max(column) for column in zip(*sizes.values(), strict=True))
     rate = _matmul_rate(workers)
     operations = sum(
         update_flops(job.program.config) * job.program.config.total_steps for job in jobs
@@ -147,21 +150,7 @@ def estimate(jobs: Sequence[Job], workers: int) -> Cost:
     steps = sum(job.program.config.total_steps for job in jobs)
     # Half the rate of a large product, and 0.2 ms for what is not products, were seen on CPUs.
     seconds = (operations / (0.5 * rate) + 2e-4 * steps) / workers
-    return Cost(len(sizes), max(sizes.values()), seconds)
-
-
-def lane_bytes(jobs: Sequence[Job]) -> dict[Any, int]:
-    """Bytes of a lane's state, by program; nothing is allocated."""
-    examples = {job.program: job.lane for job in jobs}
-
-    def size(leaf: Any) -> int:
-        key = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-        return leaf.size * (8 if key else leaf.dtype.itemsize)
-
-    return {
-        program: sum(map(size, jax.tree.leaves(jax.eval_shape(program.init, lane))))
-        for program, lane in examples.items()
-    }
+    return Cost(len(sizes), state, work, seconds)
 
 
 def update_flops(config: Config) -> float:

@@ -6,7 +6,6 @@ the same whatever the order in which lanes ended, and can be made again at any t
 """
 
 import dataclasses
-import importlib.metadata
 import json
 import platform
 import re
@@ -17,8 +16,11 @@ from typing import Any
 import jax
 import numpy as np
 
+from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
-from rtd3jax.files import read_arrays, write_arrays, write_bytes_atomically
+from rtd3jax.files import flatten, read_arrays, write_arrays, write_bytes_atomically
+from rtd3jax.policy import Policy
+from rtd3jax.saved import restore_policy
 from rtd3jax.study.figures import final_returns, learning_curves
 from rtd3jax.study.lock import deriver, is_held
 from rtd3jax.study.plan import Cell
@@ -32,6 +34,7 @@ from rtd3jax.study.results import (
 from rtd3jax.study.summary import summary_markdown
 from rtd3jax.training.checkpoint import checkpoint_steps
 from rtd3jax.training.run import check_seeds
+from rtd3jax.versions import versions_of
 
 _CURVE_ARRAYS = ("steps", "returns", "true_returns")
 _FINAL_ARRAYS = ("final_returns", "final_true_returns")
@@ -160,6 +163,31 @@ class RunDirectory:
         arrays |= {f"results.{name}": np.asarray(value) for name, value in curves.items()}
         about = {"cell": cell.to_dict(), "seed": seed, "failure": failure}
         write_arrays(self.lane_path(cell, seed), arrays, about)
+
+    def policy(self, cell: Cell, seed: int) -> Policy:
+        """The trained policy of a lane.
+
+        Raises:
+            UserError: when the lane was not trained to its end or was lost, or when its file is
+                damaged or does not fit the environment.
+        """
+        lane = f"{cell_name(cell)} seed {seed}"
+        if not self.is_done(cell, seed):
+            raise UserError(
+                f"{lane} is not trained yet in {self.path}; --status tells how far it is"
+            )
+        env, path = cell.make_env(), self.lane_path(cell, seed)
+        arrays, about = read_arrays(path)
+        if about["failure"] is not None:
+            raise UserError(f"{lane} was lost in training: {about['failure']['reason']}")
+        return restore_policy(
+            path,
+            {n.removeprefix("actor."): a for n, a in arrays.items() if n.startswith("actor.")},
+            describe(env, env.default_params),
+            algorithm=cell.config.algorithm,
+            history_length=cell.config.history_length or 0,
+            width=cell.config.hidden_size,
+        )
 
     def write_error(self, cell: Cell, seed: int, reason: str) -> None:
         """Keep the reason for which a lane could not be trained."""
@@ -306,16 +334,6 @@ def cell_name(cell: Cell) -> str:
     return re.sub(r"[^A-Za-z0-9._=+-]", "-", text)
 
 
-def flatten(tree: Any, prefix: str = "") -> dict[str, np.ndarray]:
-    """A nested dict's arrays under dotted names."""
-    if not isinstance(tree, dict):
-        return {prefix: np.asarray(tree)}
-    flat: dict[str, np.ndarray] = {}
-    for name, value in tree.items():
-        flat |= flatten(value, f"{prefix}.{name}" if prefix else name)
-    return flat
-
-
 def _reference_rows(reference: Reference) -> list[dict[str, Any]]:
     assert reference.name in REFERENCES
     key = {
@@ -333,16 +351,10 @@ def _reference_rows(reference: Reference) -> list[dict[str, Any]]:
 
 
 def _made_with() -> dict[str, Any]:
-    versions = {}
-    for package in _PACKAGES:
-        try:
-            versions[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            versions[package] = "unknown"
     device = jax.local_devices()[0]
     return {
         "python": platform.python_version(),
-        "versions": versions,
+        "versions": versions_of(_PACKAGES),
         "backend": jax.default_backend(),
         "device": device.device_kind,
         "devices": len(jax.local_devices()),

@@ -6,7 +6,6 @@ state: its random numbers are a function of seed and step, and how its steps are
 is immaterial, so a lane that goes on from a checkpoint ends with the same bits.
 """
 
-import importlib.metadata
 import re
 import time
 import warnings
@@ -21,6 +20,7 @@ import numpy as np
 from rtd3jax.errors import UserError
 from rtd3jax.files import read_arrays, write_arrays
 from rtd3jax.training.loop import Lane, LaneState, Program
+from rtd3jax.versions import versions_of
 
 DEFAULT_SECONDS = 300.0
 """Between checkpoints of a lane, unless they are so large that they take their time."""
@@ -159,14 +159,7 @@ class Checkpoints:
 
 def versions() -> dict[str, str]:
     """Versions on which a lane's bits depend."""
-    return {name: _version(name) for name in ("rtd3jax", "jax", "jaxlib")}
-
-
-def _version(package: str) -> str:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:  # run from a source tree
-        return "not installed"
+    return versions_of(("rtd3jax", "jax", "jaxlib"))
 
 
 def checkpoint_steps(directory: Path) -> list[int]:

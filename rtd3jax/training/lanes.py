@@ -47,6 +47,7 @@ class Group:
 
     Attributes:
         jobs: of one program.
+        wave: groups of a wave are begun before those of the next.
         state: of all lanes, with a leading axis where there are several; None before the start.
         step: steps done.
         returns: the curves so far on the host, [lanes, K]: ``state`` may be in use on a device.
@@ -55,6 +56,7 @@ class Group:
     """
 
     jobs: list[Job]
+    wave: int = 0
     state: LaneState | None = None
     step: int = 0
     returns: np.ndarray | None = None
@@ -104,18 +106,28 @@ def _default_device() -> Any:
     return jax.config.values["jax_default_device"] or jax.local_devices()[0]
 
 
-def make_groups(jobs: Sequence[Job], strategy: str, devices: int) -> list[Group]:
-    """Groups of one lane (``map``), or one group per program and device (``vmap``)."""
+def make_groups(
+    jobs: Sequence[Job], strategy: str, devices: int, at_once: int | None = None
+) -> list[Group]:
+    """Groups of one lane (``map``), or one group per program and device (``vmap``).
+
+    With ``at_once``, no more lanes than that are under way together, each device under ``vmap``:
+    groups are split, and wait for those before them.
+    """
+    most = at_once or len(jobs)
     if strategy == "map":
-        return [Group([job]) for job in jobs]
+        return [Group([job], wave=index // most) for index, job in enumerate(jobs)]
     by_program: dict[Any, list[Job]] = {}
     for job in jobs:
         by_program.setdefault((job.program, _structure(job.lane)), []).append(job)
-    return [
-        Group(members[start::devices])
+    shares = [
+        members[start::devices]
         for members in by_program.values()
         for start in range(min(devices, len(members)))
     ]
+    chunks = [share[k : k + most] for share in shares for k in range(0, len(share), most)]
+    # What fits one by one need not fit together with what waits beside it.
+    return [Group(chunk, wave=index // devices) for index, chunk in enumerate(chunks)]
 
 
 def advance_groups(
@@ -156,7 +168,9 @@ class _Pool:
         self._idle = [group for group in groups if not group.finished]
         self._busy = 0
         cells = list(dict.fromkeys(id(group.jobs[0].owner[0]) for group in groups))
-        self._rank = {id(group): cells.index(id(group.jobs[0].owner[0])) for group in groups}
+        self._rank = {
+            id(group): (group.wave, cells.index(id(group.jobs[0].owner[0]))) for group in groups
+        }
         self._events: list[Group] = []
         self._stopped = False
         self._changed = threading.Condition()

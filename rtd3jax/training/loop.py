@@ -250,7 +250,8 @@ class Program:
 
     def _learn(self, learner, replay, key, numbers, bounds, step) -> tuple[Learner, jax.Array]:
         """The step's updates, if it has any; the critics' loss."""
-        config, variant = self.config, VARIANTS[self.config.algorithm]
+        config = self.config
+        variant = VARIANTS[config.algorithm].at(config.precision)
         sample_key, target_key = jax.random.split(key)
         updates = step - config.learning_starts + 1
         numbers = numbers.at(step.astype(jnp.float32) / config.total_steps)

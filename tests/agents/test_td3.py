@@ -22,6 +22,7 @@ def _numbers(**changes):
         critic_learning_rate=2e-2,
         final_learning_rate_fraction=0.25,
         gamma=0.9,
+        reward_scale=1.0,
         tau=0.1,
         exploration_noise=0.1,
         target_noise=0.2,
@@ -77,6 +78,10 @@ def test_target_is_the_formula(problem):
         for critic in learner.target_critics
     ]
     assert not np.allclose(*values)
+    scaled = td3.target(
+        learner, variant, batch, jax.random.key(9), _numbers(reward_scale=5), BOUNDS
+    )
+    np.testing.assert_allclose(scaled - got, 4 * np.asarray(batch.reward), rtol=1e-4, atol=1e-5)
     bootstrap = 0.9 * np.minimum(*values)[:, 0] * ~np.asarray(batch.terminated)
     np.testing.assert_allclose(got, np.asarray(batch.reward) + bootstrap, rtol=1e-5, atol=1e-6)
 

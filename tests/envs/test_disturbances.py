@@ -12,11 +12,11 @@ from rtd3jax.envs.disturbances import DampedSine, GaussianNoise, Hidden, Pulses,
 from rtd3jax.envs.disturbed import Disturbed, DisturbedParams
 from rtd3jax.envs.pendulum import Pendulum
 from rtd3jax.envs.process import Chain, Process
-from rtd3jax.envs.registry import DISTURBANCES, make
+from rtd3jax.envs.registry import DISTURBANCES, FAULTS, make
 from rtd3jax.errors import UserError
 
 EPISODES, STEPS = 1000, 200
-ADDITIVE = [name for name in DISTURBANCES["pendulum"] if name != "hidden"]
+OWN = [name for name in DISTURBANCES["pendulum"] if name not in FAULTS]
 
 
 @dataclasses.dataclass
@@ -80,7 +80,7 @@ def uniform_distance(values, low, high):
     return distance * np.sqrt(count) / 1.95
 
 
-@pytest.mark.parametrize("disturbance", DISTURBANCES["pendulum"])
+@pytest.mark.parametrize("disturbance", OWN)
 def test_true_state_and_true_reward_are_untouched(disturbance):
     result = roll(disturbance)
     pendulum = Pendulum()
@@ -163,7 +163,7 @@ def trace(process, horizon, steps, count, size=3):
             return state, signal
 
         return jax.lax.scan(
-            body, process.init(key_init, horizon), jax.random.split(key_steps, steps)
+            body, process.init(key_init, horizon, size), jax.random.split(key_steps, steps)
         )[1]
 
     keys = jax.random.split(jax.random.key(3), count)
@@ -302,7 +302,7 @@ def test_noise_can_reward_the_true_state():
 class Stamp(Process):
     """Adds a number drawn per episode, and 1000 per observation of the episode so far."""
 
-    def init(self, key, horizon):
+    def init(self, key, horizon, size):
         return jax.random.uniform(key, (), jnp.float32, 1.0, 900.0), jnp.zeros((), jnp.int32)
 
     def step(self, key, state, signal):

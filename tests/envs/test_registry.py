@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from rtd3jax.envs import registry
-from rtd3jax.envs.disturbances import Sine
+from rtd3jax.envs.disturbances import GaussianNoise, Hidden, Sine
 from rtd3jax.envs.disturbed import Disturbed
+from rtd3jax.envs.faults import Delay, Dropout
+from rtd3jax.envs.process import Chain
 from rtd3jax.envs.registry import DISTURBANCES, ENVIRONMENTS, make, parse_disturbance, register
 from rtd3jax.errors import UserError, nearest
 
@@ -231,8 +233,32 @@ def test_registered_environments_are_made(monkeypatch):
     for taken in ("mine", "pendulum", "Pendulum-v1"):
         with pytest.raises(UserError, match="exists already"):
             register(taken, lambda disturbance: None)
-    with pytest.raises(UserError, match="not callable"):
-        register("other", 3)
+    for unfit in (3, type(make("rover"))):
+        with pytest.raises(UserError, match="must be an environment or a function"):
+            register("other", unfit)
+    with pytest.raises(UserError, match="not for a function"):
+        register("other", lambda disturbance: None, {})
+
+
+def test_a_registered_environment_gets_parameters_and_disturbances(monkeypatch):
+    monkeypatch.setattr(registry, "_registered", {})
+    base = make("PointRobot-misc")
+    register("robot", base, {"lag": ("action", Delay(3)), "noise": GaussianNoise()})
+    env = make("robot", "lag+noise+dropout", max_force=0.2, sigma=0.1, p=0.5)
+    assert env.base is base and env == make("robot", "noise+lag+dropout")
+    params = env.default_params
+    assert params.env.max_force == 0.2 and params.action == Delay(3)
+    assert params.process == Chain((GaussianNoise(0.1), Dropout(p=0.5)))
+    assert make("robot", max_steps_in_episode=7).default_params.max_steps_in_episode == 7
+    with pytest.raises(UserError, match="did you mean 'noise'"):
+        make("robot", "nois")
+    with pytest.raises(UserError, match="exists already"):
+        register("robot", base)
+    for name in ("dropout", "none", "a+b", "a:b", ""):
+        with pytest.raises(UserError, match="cannot be called"):
+            register("robot2", base, {name: Delay()})
+    with pytest.raises(UserError, match="element 9"):
+        register("robot2", base, {"blind": Hidden(element=9)})
 
 
 def test_nearest_says_nothing_without_a_likeness():

@@ -1,0 +1,198 @@
+"""Time of one control step of each exported form, one plant, one core.
+
+Usage: taskset -c 0 python experiments/benchmarks/latency.py [--quick] [--out DIR]
+
+Six agents at l = 10 and H = 128 with untrained weights, which cost what trained ones do, on the
+pendulum's observation. A repeat plays 200 steps and takes their median; the figure is the least
+median of all repeats, because a busy machine only ever adds to it. Observations come as numpy
+arrays and actions are waited for, as on a robot.
+"""
+
+import argparse
+import csv
+import importlib.util
+import os
+import pathlib
+import platform
+import sys
+import tempfile
+import time
+
+# Before numpy and JAX are imported: one thread each.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import onnxruntime
+
+import rtd3jax as rtd
+from rtd3jax.agents.networks import init_network, part_sizes
+from rtd3jax.agents.td3 import Bounds
+from rtd3jax.agents.variants import VARIANTS
+
+RESULTS = pathlib.Path(__file__).parents[1] / "results" / "benchmarks"
+OBSERVATIONS, ACTIONS = 3, 1
+STEPS = 200
+
+
+def policy_of(algorithm, length, width):
+    length = 0 if algorithm == "td3" else length
+    sizes = part_sizes(OBSERVATIONS, ACTIONS)
+    actor = init_network(jax.random.key(0), VARIANTS[algorithm].actor, sizes, width, ACTIONS)
+    return rtd.Policy(
+        actor=actor,
+        bounds=Bounds(jnp.full(ACTIONS, -2.0), jnp.full(ACTIONS, 2.0)),
+        history_length=jnp.int32(length),
+        algorithm=algorithm,
+        tokens=length,
+        observation_size=OBSERVATIONS,
+        action_shape=(ACTIONS,),
+    )
+
+
+def numpy_player(policy, directory):
+    path = directory / "player.py"
+    policy.export(path, format="numpy", overwrite=True)
+    spec = importlib.util.spec_from_file_location("player", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.Player().step
+
+
+def onnx_player(policy, directory):
+    path = directory / "policy.onnx"
+    policy.export(path, format="onnx", overwrite=True)
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    state = {s.name: np.zeros((1, *s.shape[1:]), np.float32) for s in session.get_inputs()[1:]}
+
+    def step(observation):
+        action, *after = session.run(None, {"observation": observation[None], **state})
+        state.update(zip(state, after, strict=True))
+        return action[0]
+
+    return step
+
+
+def stablehlo_player(policy, directory):
+    path = directory / "policy.stablehlo"
+    policy.export(path, format="stablehlo", overwrite=True)
+    program = rtd.load_stablehlo(path)
+    state = program.init()
+
+    def step(observation):
+        nonlocal state
+        action, state = program.step(state, observation[None])
+        return np.asarray(action)[0]
+
+    return step
+
+
+def jax_player(policy, directory):
+    jitted = jax.jit(policy.step)
+    state = policy.init()
+
+    def step(observation):
+        nonlocal state
+        action, state = jitted(state, observation)
+        return np.asarray(action)
+
+    return step
+
+
+FORMS = {
+    "numpy": numpy_player,
+    "onnx": onnx_player,
+    "stablehlo": stablehlo_player,
+    "jax (policy.step)": jax_player,
+}
+
+
+def median_microseconds(step, observations):
+    times = []
+    for observation in observations:
+        began = time.perf_counter()
+        step(observation)
+        times.append(time.perf_counter() - began)
+    return 1e6 * float(np.median(times))
+
+
+def measure(agents, length, width, repeats):
+    """Rows of agent, form and microseconds; forms and agents take turns through the repeats."""
+    chance = np.random.default_rng(0)
+    observations = chance.normal(size=(STEPS, OBSERVATIONS)).astype(np.float32)
+    with tempfile.TemporaryDirectory() as name:
+        directory = pathlib.Path(name)
+        players = {
+            (algorithm, form): make(policy_of(algorithm, length, width), directory)
+            for algorithm in agents
+            for form, make in FORMS.items()
+        }
+        for step in players.values():
+            step(observations[0])
+        best = dict.fromkeys(players, np.inf)
+        for _ in range(repeats):
+            for key, step in players.items():
+                best[key] = min(best[key], median_microseconds(step, observations))
+    return [
+        {"agent": agent, "form": form, "history_length": length, "width": width, "us": round(us, 1)}
+        for (agent, form), us in best.items()
+    ]
+
+
+def report(rows, repeats):
+    table = {(row["agent"], row["form"]): row["us"] for row in rows}
+    first = rows[0]
+    lines = [
+        "| agent | " + " | ".join(FORMS) + " |",
+        "|---" * (1 + len(FORMS)) + "|",
+        *(
+            f"| `{agent}` | " + " | ".join(f"{table[agent, form]:.0f}" for form in FORMS) + " |"
+            for agent in dict.fromkeys(row["agent"] for row in rows)
+        ),
+    ]
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else "all"
+    return (
+        "# Latency of a control step\n\n"
+        f"Microseconds, one plant, l = {first['history_length']}, H = {first['width']}: the least "
+        f"of {repeats} medians of {STEPS} steps, since other work on the machine only adds. "
+        f"Cores allowed: {cores}.\n\n"
+        + "\n".join(lines)
+        + f"\n\n{_processor()}; jax {jax.__version__}, onnxruntime {onnxruntime.__version__}, "
+        f"numpy {np.__version__}, Python {platform.python_version()}.\n\n"
+        "Command: `taskset -c 0 python experiments/benchmarks/latency.py`\n"
+    )
+
+
+def _processor():
+    try:
+        lines = pathlib.Path("/proc/cpuinfo").read_text().splitlines()
+        return next(s.split(":")[1].strip() for s in lines if s.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def main(arguments=None):
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="two agents, l = 2, H = 8")
+    parser.add_argument("--out", type=pathlib.Path, default=RESULTS, help="where latency.* go")
+    options = parser.parse_args(arguments)
+    length, width, repeats = (2, 8, 1) if options.quick else (10, 128, 100)
+    agents = ("td3", "lstm-td3") if options.quick else rtd.ALGORITHMS
+    rows = measure(agents, length, width, repeats)
+    options.out.mkdir(parents=True, exist_ok=True)
+    with (options.out / "latency.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    text = report(rows, repeats)
+    (options.out / "latency.md").write_text(text)
+    print(text)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""A trained actor in forms that run without the trainer."""

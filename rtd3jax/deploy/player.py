@@ -1,0 +1,125 @@
+"""A trained policy that needs nothing but numpy.
+
+    player = Player()
+    player.reset()                       # at the start of every episode
+    action = player.step(observation)    # once per control step
+
+`ABOUT` says what the policy is. The window that the agent reads is kept as LSTM carries side by
+side, each begun at another of the last steps; one product advances them all, and the last row is
+the one that has read the whole window. Carries of zeros are the start of an episode.
+"""
+
+import base64
+from typing import Any
+
+import numpy as np
+
+ABOUT: dict[str, Any] = {}
+WEIGHTS = ""
+
+
+class Player:
+    """The policy, with one episode's state; use one player for each plant.
+
+    Args:
+        about: the policy's header; the file's own by default.
+        weights: base64 of its arrays, float32 and little-endian, in the header's order.
+    """
+
+    def __init__(self, about: dict[str, Any] = ABOUT, weights: str = WEIGHTS) -> None:
+        self.about = about
+        self.observation_size: int = about["observation_size"]
+        self.action_shape: tuple[int, ...] = tuple(about["action_shape"])
+        arrays = _unpack(about["arrays"], weights)
+        self._linear = {
+            name: (arrays[f"{name}_kernel"], arrays[f"{name}_bias"])
+            for name in ("encoder", "current", "head", "output")
+            if f"{name}_kernel" in arrays
+        }
+        self._centre, self._half_range = arrays["action_centre"], arrays["action_half_range"]
+        self._length: int = about["history_length"]
+        self._with_current: bool = about["memory_has_current"]
+        if about["memory"]:
+            width = arrays["head_bias"].size
+            # sigmoid(x) = tanh(x / 2) / 2 + 1/2: halved here, all four gates are one tanh.
+            half = np.repeat(np.array([0.5, 0.5, 0.5, 1.0], np.float32), width)
+            self._input = arrays["input_kernel"] * half, arrays["input_bias"] * half
+            self._recurrent = arrays["recurrent_kernel"] * half
+            self._rows = self._length + self._with_current
+            self._gates = np.empty((self._rows, 4 * width), np.float32)
+            self._hidden = np.zeros((self._length + 1, width), np.float32)
+            self._cell = np.zeros((self._length + 1, width), np.float32)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget: the next step is the first of an episode."""
+        self._previous_action = np.zeros_like(self._centre)
+        if self.about["memory"]:
+            self._hidden[:] = 0.0
+            self._cell[:] = 0.0
+
+    def step(self, observation: Any) -> np.ndarray:
+        """The action for ``observation`` [O], in the environment's units, of `action_shape`.
+
+        Raises:
+            ValueError: when the observation has another size or is not finite; nothing is
+                remembered of it then.
+        """
+        observation = np.asarray(observation, np.float32)
+        if observation.shape != (self.observation_size,):
+            raise ValueError(
+                f"the policy expects observations of shape ({self.observation_size},), "
+                f"not {observation.shape}"
+            )
+        if not np.isfinite(observation).all():
+            raise ValueError(f"the observation {observation} is not finite")
+        parts = {"observation": observation, "previous_action": self._previous_action}
+        features = []
+        if self.about["memory"]:
+            features.append(self._feed(parts) if self._with_current else self._hidden[-1].copy())
+        if self.about["current"]:
+            features.append(self._relu("current", _join(parts, self.about["current"])))
+        head = self._relu("head", features[0] if len(features) == 1 else np.concatenate(features))
+        kernel, bias = self._linear["output"]
+        action = self._centre + self._half_range * np.tanh(head @ kernel + bias)
+        if self.about["memory"] and not self._with_current:
+            self._feed({**parts, "action": action})
+        self._previous_action = action
+        return action.reshape(self.action_shape).copy()
+
+    def _feed(self, parts: dict[str, np.ndarray]) -> np.ndarray:
+        """Give all carries the step's token; the hidden state of the one that began first."""
+        kernel, bias = self._input
+        token = self._relu("encoder", _join(parts, self.about["memory"])) @ kernel + bias
+        rows, width = self._rows, self._hidden.shape[1]
+        # Row 0 is zero for ever: the carry that begins with this token.
+        gates = np.matmul(self._hidden[:rows], self._recurrent, out=self._gates)
+        gates += token
+        np.tanh(gates, out=gates)
+        sigmoids = gates[:, : 3 * width]
+        sigmoids *= 0.5
+        sigmoids += 0.5
+        i, f, o, g = (gates[:, k * width : (k + 1) * width] for k in range(4))
+        cell = f * self._cell[:rows] + i * g
+        hidden = o * np.tanh(cell)
+        self._hidden[1:] = hidden[: self._length]
+        self._cell[1:] = cell[: self._length]
+        return hidden[-1]
+
+    def _relu(self, layer: str, x: np.ndarray) -> np.ndarray:
+        kernel, bias = self._linear[layer]
+        return np.maximum(x @ kernel + bias, np.float32(0.0))
+
+
+def _join(parts: dict[str, np.ndarray], names: list[str]) -> np.ndarray:
+    return parts[names[0]] if len(names) == 1 else np.concatenate([parts[n] for n in names])
+
+
+def _unpack(shapes: dict[str, list[int]], weights: str) -> dict[str, np.ndarray]:
+    flat = np.frombuffer(base64.b64decode(weights), "<f4").astype(np.float32)
+    arrays, begin = {}, 0
+    for name, shape in shapes.items():
+        end = begin + int(np.prod(shape))
+        arrays[name] = flat[begin:end].reshape(shape)
+        begin = end
+    return arrays

@@ -1,0 +1,177 @@
+"""The StableHLO form: a portable XLA program of any batch size, run by any later JAX.
+
+The file is a safetensors file with one array of bytes, ``program``, and the policy's header.
+"""
+
+import contextlib
+import os
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.export
+import jax.numpy as jnp
+import numpy as np
+
+from rtd3jax.deploy.model import Model
+from rtd3jax.errors import UserError
+from rtd3jax.files import array_bytes, read_arrays
+
+PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
+"""Where the program may run."""
+
+FORMAT = 1
+_KIND = "stablehlo"
+
+State = dict[str, jax.Array]
+
+
+def stablehlo_bytes(model: Model) -> bytes:
+    """The file of ``(state, observation [B, O]) -> (action [B, *action_shape], state)``.
+
+    Raises:
+        UserError: when the package flatbuffers is missing.
+    """
+    _require_flatbuffers()
+    arrays = {name: jnp.asarray(array) for name, array in model.arrays.items()}
+    (batch,) = jax.export.symbolic_shape("batch")
+
+    def spec(shape: tuple[int, ...]) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((batch, *shape), jnp.float32)
+
+    def policy_step(state: State, observation: jax.Array) -> tuple[jax.Array, State]:
+        # Accelerators would otherwise round products of float32 to fewer bits.
+        with jax.default_matmul_precision("highest"):
+            return play(model, arrays, state, observation)
+
+    with _no_source_locations():
+        exported = jax.export.export(jax.jit(policy_step), platforms=PLATFORMS)(
+            {name: spec(shape) for name, shape in model.state_shapes.items()},
+            spec((model.observation_size,)),
+        )
+        program = np.frombuffer(bytes(exported.serialize()), np.uint8)
+    header = {**model.header(), "kind": _KIND, "format": FORMAT}
+    return array_bytes({"program": program}, header)
+
+
+def play(
+    model: Model, arrays: State, state: State, observation: jax.Array
+) -> tuple[jax.Array, State]:
+    """The recurrence of `rtd3jax.deploy.model` for ``observation`` [B, O]."""
+    parts = {"observation": observation}
+    if "previous_action" in state:
+        parts["previous_action"] = state["previous_action"]
+
+    def linear(layer: str, x: jax.Array) -> jax.Array:
+        return x @ arrays[f"{layer}_kernel"] + arrays[f"{layer}_bias"][None, :]
+
+    def feed(hidden: jax.Array, cell: jax.Array) -> tuple[jax.Array, jax.Array]:
+        token = jnp.concatenate([parts[part] for part in model.memory], axis=-1)
+        token = linear("input", jax.nn.relu(linear("encoder", token)))
+        gates = hidden @ arrays["recurrent_kernel"] + token[:, None, :]
+        i, f, o, g = jnp.split(gates, 4, axis=-1)
+        cell = jax.nn.sigmoid(f) * cell + jax.nn.sigmoid(i) * jnp.tanh(g)
+        return jax.nn.sigmoid(o) * jnp.tanh(cell), cell
+
+    features = []
+    if model.memory:
+        zero_row = ((0, 0), (1, 0), (0, 0))
+        hidden, cell = (jnp.pad(state[name], zero_row) for name in ("hidden", "cell"))
+        if model.memory_has_current:
+            hidden, cell = feed(hidden, cell)
+        features.append(hidden[:, -1])
+        hidden, cell = hidden[:, :-1], cell[:, :-1]
+    if model.current:
+        current = jnp.concatenate([parts[part] for part in model.current], axis=-1)
+        features.append(jax.nn.relu(linear("current", current)))
+    head = jax.nn.relu(linear("head", jnp.concatenate(features, axis=-1)))
+    centre, half_range = arrays["action_centre"], arrays["action_half_range"]
+    action = centre[None, :] + half_range[None, :] * jnp.tanh(linear("output", head))
+    parts["action"] = action
+    if model.memory and not model.memory_has_current:
+        hidden, cell = feed(hidden, cell)
+    following = {"previous_action": action}
+    if model.memory:
+        following |= {"hidden": hidden, "cell": cell}
+    action = action.reshape(-1, *model.action_shape)
+    return action, {name: following[name] for name in model.state_shapes}
+
+
+@contextlib.contextmanager
+def _no_source_locations() -> Iterator[None]:
+    """Keep the caller's source lines, and so this machine's paths, out of the program."""
+    option = "jax_traceback_in_locations_limit"
+    limit = getattr(jax.config, option)
+    jax.config.update(option, 0)
+    try:
+        yield
+    finally:
+        jax.config.update(option, limit)
+
+
+def _require_flatbuffers() -> None:
+    try:
+        import flatbuffers  # noqa: F401, jax.export serialises with it without requiring it
+    except ImportError as error:
+        raise UserError(
+            "StableHLO files need the package flatbuffers: pip install 'rtd3jax[stablehlo]'"
+        ) from error
+
+
+class StableHlo:
+    """A policy loaded from a StableHLO file; jittable, batched.
+
+    Attributes:
+        about: the file's header.
+    """
+
+    def __init__(self, about: dict[str, Any], exported: jax.export.Exported):
+        self.about = about
+        self.observation_size = int(about["observation_size"])
+        self._call = jax.jit(exported.call)
+
+    def init(self, batch: int = 1) -> State:
+        """The state before the first step of ``batch`` episodes: zeros, [batch, ...]."""
+        return {
+            name: jnp.zeros((batch, *shape), jnp.float32)
+            for name, shape in self.about["state"].items()
+        }
+
+    def step(self, state: State, observation: Any) -> tuple[jax.Array, State]:
+        """Actions [B, *action_shape] for float32 observations [B, O], and the state after them.
+
+        Raises:
+            UserError: when the observations have another size.
+        """
+        if not isinstance(observation, jax.Array):
+            observation = np.asarray(observation, np.float32)
+        if observation.ndim != 2 or observation.shape[1] != self.observation_size:
+            raise UserError(
+                f"the policy expects observations of shape (batch, {self.observation_size}), "
+                f"not {observation.shape}"
+            )
+        return self._call(state, observation)
+
+
+def load_stablehlo(path: str | os.PathLike) -> StableHlo:
+    """The policy that ``policy.export(path, format="stablehlo")`` wrote.
+
+    Raises:
+        UserError: when the file is missing, damaged, something else, or of a newer format; when
+            the package flatbuffers is missing.
+    """
+    _require_flatbuffers()
+    arrays, about = read_arrays(path)
+    if not isinstance(about, dict) or about.get("kind") != _KIND or "program" not in arrays:
+        raise UserError(f"{path} is not a policy in StableHLO")
+    if about.get("format") != FORMAT:
+        raise UserError(
+            f"{path} has format {about.get('format')}, and this version of rtd3jax reads {FORMAT}: "
+            "use the version that wrote it, or a newer one"
+        )
+    try:
+        exported = jax.export.deserialize(bytearray(arrays["program"].tobytes()))
+    except Exception as error:  # of many kinds, and all mean the same
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise UserError(f"{path} cannot be read by this version of JAX ({reason})") from error
+    return StableHlo(about, exported)

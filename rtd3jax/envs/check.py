@@ -1,0 +1,361 @@
+"""What goes wrong with environments in practice, found by playing them."""
+
+import dataclasses
+import functools
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rtd3jax.envs.interface import (
+    DEFAULT_STEP_LIMIT,
+    Interface,
+    Survey,
+    environment_name,
+    foreign_code,
+    survey,
+)
+from rtd3jax.errors import UserError
+
+EPISODES = 8
+LONGEST_EPISODE = 1_000
+"""Steps after which an episode is no longer followed."""
+
+AFTER_RESET = 8
+"""Steps for which two new episodes are compared."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """One thing that is wrong, and what to do about it; both are one line.
+
+    Attributes:
+        kind: ``interface`` (what every training refuses), ``dtype``, ``space``, ``vmap``,
+            ``finite``, ``pure``, ``leak``, ``final-observation``, ``time-limit``.
+        problem: what was seen.
+        remedy: what to do.
+    """
+
+    kind: str
+    problem: str
+    remedy: str
+
+    def __str__(self) -> str:
+        """The problem and its remedy."""
+        return f"{self.problem}; {self.remedy}" if self.remedy else self.problem
+
+
+def check_env(env: Any, *, params: Any = None, seed: int = 0) -> None:
+    """Play ``env`` with random actions, and raise if anything is wrong with it.
+
+    Eight episodes are played to their end, for at most 1,000 steps; the environment is compiled for
+    it.
+
+    Args:
+        env: a gymnax >= 1.0 environment.
+        params: its parameters; its own by default.
+        seed: of the episodes and actions.
+
+    Raises:
+        UserError: one that lists every `Finding` with its remedy, on lines of their own if there
+            are several.
+    """
+    findings = find_problems(env, params=params, seed=seed)
+    if findings:
+        lines = [str(finding) for finding in findings]
+        name = environment_name(env)
+        if len(lines) == 1:
+            kind_of_prefix = f"environment {name}"
+            line = lines[0]
+            raise UserError(
+                line if line.startswith(kind_of_prefix) else f"{kind_of_prefix}: {line}"
+            )
+        raise UserError(
+            f"environment {name} has {len(lines)} problems:\n"
+            + "\n".join(f"  {number}. {line}" for number, line in enumerate(lines, 1))
+        )
+
+
+def find_problems(env: Any, *, params: Any = None, seed: int = 0) -> list[Finding]:
+    """What `check_env` would raise, as a list; empty for a sound environment."""
+    if params is None:
+        params = getattr(env, "default_params", None)
+    found = survey(env, params)
+    findings = [Finding("interface", str(error), "") for error in found.problems]
+    if found.reset is None or found.step is None:
+        return findings
+    findings += _dtypes(found)
+    findings += _spaces(env, params, found)
+    if findings:  # what follows would fail on the same thing, or for it
+        return findings
+    assert found.interface is not None
+    with foreign_code():
+        return list(_played(env, params, found.interface, seed))
+
+
+def _dtypes(found: Survey) -> Iterator[Finding]:
+    """Arrays that change their type between reset and step."""
+    assert found.reset is not None and found.step is not None
+    before, after = found.reset, found.step[:2]
+    remedy = "loops and automatic resets need equal ones: convert in both, e.g. jnp.float32(...)"
+    pairs: Any = zip(("observation", "state"), before, after, strict=True)
+    for what, one, other in pairs:
+        structures: list[Any] = [jax.tree.structure(one), jax.tree.structure(other)]
+        if structures[0] != structures[1]:
+            problem = f"the {what} of reset and that of step are different kinds of structure"
+            yield Finding("dtype", problem, "return the same dataclass from both")
+            continue
+        leaves = jax.tree_util.tree_leaves_with_path(one)
+        for (path, leaf), new in zip(leaves, jax.tree.leaves(other), strict=True):
+            if (leaf.dtype, leaf.shape) != (new.dtype, new.shape):
+                where = f"{what}{jax.tree_util.keystr(path)}"
+                problem = (
+                    f"{where} is {leaf.dtype}{list(leaf.shape)} after reset and "
+                    f"{new.dtype}{list(new.shape)} after step"
+                )
+                yield Finding("dtype", problem, remedy)
+
+
+def _spaces(env: Any, params: Any, found: Survey) -> Iterator[Finding]:
+    """Shapes that disagree with the space that the environment declares."""
+    assert found.reset is not None
+    try:
+        space = env.observation_space(params)
+    except Exception:  # declaring none is allowed
+        return
+    shape = tuple(getattr(space, "shape", None) or ())
+    if shape != found.reset[0].shape:
+        yield Finding(
+            "space",
+            f"observation_space has shape {shape}, the observation {found.reset[0].shape}",
+            "make observation_space(params) describe what reset and step return",
+        )
+
+
+def _played(env: Any, params: Any, interface: Interface, seed: int) -> Iterator[Finding]:
+    """What shows only when it runs."""
+    limit = getattr(params, "max_steps_in_episode", None)
+    steps = int(min(LONGEST_EPISODE, DEFAULT_STEP_LIMIT if limit is None else limit))
+    try:
+        record = _episodes(env, params, interface, seed, steps)
+    except Exception as error:
+        reason = (str(error).strip().splitlines() or [""])[0]
+        yield Finding(
+            "vmap",
+            f"it cannot be vmapped: {type(error).__name__}: {reason}",
+            "write reset and step for one lane in jax.numpy alone; "
+            "a pure_callback needs a vmap_method",
+        )
+        return
+    yield from _finite(record)
+    yield from _time_limits(record, limit, steps)
+    yield from _final_observations(record)
+    impure = list(_pure(env, params, record, seed))
+    yield from impure
+    if not impure:  # what is random cannot be compared
+        yield from _leaks(env, params, record, seed)
+
+
+@dataclasses.dataclass
+class _Record:
+    """Eight first episodes E of up to T steps; numpy, but for the states.
+
+    Attributes:
+        first: [E, O], observations of reset.
+        seen, final: [E, T, O], the observation of step and info's ``final_observation``.
+        reward, terminated, truncated: [E, T].
+        last_state: [E, ...], before the step that ended the episode (or the last one played).
+        last_action: [E, ...], of that step.
+    """
+
+    first: np.ndarray
+    seen: np.ndarray
+    final: np.ndarray
+    reward: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+    last_state: Any
+    last_action: Any
+
+    @property
+    def length(self) -> np.ndarray:
+        """int [E], steps of the episode; T + 1 where it did not end."""
+        done = self.terminated | self.truncated
+        return np.where(done.any(1), done.argmax(1) + 1, done.shape[1] + 1)
+
+    @property
+    def ended(self) -> np.ndarray:
+        """bool [E]: whether the episode ended."""
+        return (self.terminated | self.truncated).any(1)
+
+
+def _episodes(env: Any, params: Any, interface: Interface, seed: int, steps: int) -> _Record:
+    def episode(key: jax.Array, keys: jax.Array, actions: jax.Array, params: Any) -> tuple:
+        first, state = env.reset(key, params)
+        actions = actions.reshape(steps, *interface.action_shape)
+
+        def step(carry: tuple, inputs: tuple) -> tuple:
+            state, last_state, last_action, ended = carry
+            key, action = inputs
+            last_state = jax.tree.map(
+                lambda old, new: jnp.where(ended, old, new), last_state, state
+            )
+            last_action = jnp.where(ended, last_action, action)
+            seen, state, reward, terminated, truncated, info = env.step(key, state, action, params)
+            terminated, truncated = terminated.astype(bool), truncated.astype(bool)
+            out = (seen, info["final_observation"], reward, terminated, truncated)
+            return (state, last_state, last_action, ended | terminated | truncated), out
+
+        start = (state, state, actions[0], jnp.array(False))
+        played: Any = jax.lax.scan(step, start, (keys, actions))
+        (_, last_state, last_action, _), out = played
+        return first, *out, last_state, last_action
+
+    draws = _draw(seed, interface.action_low, interface.action_high, steps)
+    played = jax.jit(jax.vmap(episode, in_axes=(0, 0, 0, None)))(*draws, params)
+    return _Record(*(np.asarray(part) for part in played[:6]), *played[6:])
+
+
+@functools.partial(jax.jit, static_argnames="steps")
+def _draw(seed: jax.Array, low: jax.Array, high: jax.Array, steps: int) -> tuple[jax.Array, ...]:
+    """Keys of resets [E] and steps [E, T], and actions [E, T, A]; compiled once for all worlds."""
+    key_resets, key_steps, key_actions = jax.random.split(jax.random.key(seed), 3)
+    shape = (EPISODES, steps)
+    actions = jax.random.uniform(key_actions, (*shape, *low.shape), jnp.float32, low, high)
+    return jax.random.split(key_resets, EPISODES), jax.random.split(key_steps, shape), actions
+
+
+def _finite(record: _Record) -> Iterator[Finding]:
+    """Infinities and NaN within the first episodes."""
+    remedy = "look for a division by zero, a logarithm or a state that runs away"
+    if not np.all(np.isfinite(record.first)):
+        yield Finding("finite", "the observation of reset is not finite", remedy)
+        return
+    for what, values in (("observation", record.final), ("reward", record.reward)):
+        good = np.isfinite(values.reshape(*values.shape[:2], -1)).all(-1)
+        if not good.all():
+            step = int(np.argmin(good.all(0)))
+            yield Finding("finite", f"the {what} of step {step} is not finite", remedy)
+
+
+def _pure(env: Any, params: Any, record: _Record, seed: int) -> Iterator[Finding]:
+    """The same key and state that give another result."""
+    state, action = _pick((record.last_state, record.last_action), 0)
+
+    def both() -> tuple:
+        key = jax.random.key(seed)
+        return env.reset(key, params), env.step(key, state, action, params)
+
+    results = []
+    # The setting changes no number here. But it is part of the key under which JAX keeps programs,
+    # so that the Python code is run again, and what it takes from outside shows.
+    for rank_promotion in ("allow", "warn"):
+        with warnings.catch_warnings(), jax.numpy_rank_promotion(rank_promotion):
+            warnings.simplefilter("ignore")
+            program = jax.jit(lambda: both())
+            results += [program(), program()]
+    for index, what in enumerate(("reset", "step")):
+        if not all(_equal(results[0][index], other[index]) for other in results[1:]):
+            yield Finding(
+                "pure",
+                f"{what} gives another result for the same key, state and action",
+                "keep everything that changes in the state, and draw with jax.random from the key",
+            )
+            return  # an automatic reset is within step
+
+
+def _time_limits(record: _Record, limit: Any, steps: int) -> Iterator[Finding]:
+    """A time limit that is reported as a termination, or not kept."""
+    known = limit is not None and int(limit) <= steps
+    at_limit = record.length == (int(limit) if known else record.length[0])
+    last = np.minimum(record.length, record.terminated.shape[1]) - 1
+    terminated = record.terminated[np.arange(EPISODES), last]
+    if record.ended.all() and at_limit.all() and terminated.all() and record.length[0] > 1:
+        yield Finding(
+            "time-limit",
+            f"all {EPISODES} episodes terminate at step {record.length[0]}: that is a time limit",
+            "report it as truncated, not as terminated, or bootstrapping stops there: "
+            "leave it to gymnax's is_truncated and params.max_steps_in_episode",
+        )
+    elif known and (record.length > int(limit)).any():
+        yield Finding(
+            "time-limit",
+            f"an episode goes on after params.max_steps_in_episode = {int(limit)} steps",
+            "count the steps in state.time, which gymnax's is_truncated reads",
+        )
+
+
+def _final_observations(record: _Record) -> Iterator[Finding]:
+    """``final_observation`` that is not the observation before the reset."""
+    done = record.terminated | record.truncated
+    inside, same = ~done, np.all(record.final == record.seen, axis=-1)
+    moving = np.ptp(record.final, axis=1).max() > 0
+    if not same[inside].all():
+        yield Finding(
+            "final-observation",
+            "info['final_observation'] differs from the observation though the episode goes on",
+            "let it be the observation before the automatic reset at every step",
+        )
+    elif done.any() and moving and same[done].all():
+        yield Finding(
+            "final-observation",
+            "info['final_observation'] of an ended episode is the next episode's first observation",
+            "take it before the automatic reset",
+        )
+
+
+def _leaks(env: Any, params: Any, record: _Record, seed: int) -> Iterator[Finding]:
+    """A new episode that depends on the one before it.
+
+    Two different episodes end with the same key, so that the automatic reset gets the same random
+    numbers; from then on both get the same keys and actions, and must look alike.
+    """
+    pairs = np.flatnonzero(record.ended)[:2]
+    if len(pairs) < 2:
+        return
+
+    def go_on(state: Any, action: jax.Array, params: Any) -> tuple:
+        key = jax.random.key(seed)
+        first, state, _, terminated, truncated, _ = env.step(key, state, action, params)
+
+        def step(state: Any, key: jax.Array) -> tuple:
+            seen, state, reward, *_ = env.step(key, state, _pick(record.last_action, 0), params)
+            return state, (seen, reward)
+
+        played: Any = jax.lax.scan(step, state, jax.random.split(key, AFTER_RESET))
+        return terminated.astype(bool) | truncated.astype(bool), first, *played[1]
+
+    both = jax.tree.map(lambda leaf: leaf[pairs], (record.last_state, record.last_action))
+    done, *new = jax.jit(jax.vmap(go_on, in_axes=(0, 0, None)))(*both, params)
+    if np.all(done) and not all(_close(part[0], part[1]) for part in new):
+        yield Finding(
+            "leak",
+            "an episode depends on the one before it: reset does not restore the whole state",
+            "make the state anew in reset_env, and let no wrapper carry parts of it over",
+        )
+
+
+def _pick(tree: Any, index: int) -> Any:
+    return jax.tree.map(lambda leaf: leaf[index], tree)
+
+
+def _close(one: Any, other: Any) -> bool:
+    return np.allclose(np.asarray(one), np.asarray(other), rtol=1e-5, atol=1e-6, equal_nan=True)
+
+
+def _equal(one: Any, other: Any) -> bool:
+    """Whether two results are the same to the bit; random keys by their data."""
+
+    def data(leaf: Any) -> np.ndarray:
+        if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            leaf = jax.random.key_data(leaf)
+        return np.asarray(leaf)
+
+    leaves = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+    return all(
+        np.array_equal(data(a), data(b), equal_nan=jnp.issubdtype(data(a).dtype, jnp.inexact))
+        for a, b in leaves
+    )

@@ -1,0 +1,179 @@
+"""Our worlds as Gymnasium environments: one at a time, numpy in and out, seeded by reset.
+
+gymnasium is imported by gymnax already, so that nothing here makes importing rtd3jax slower.
+"""
+
+import functools
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnax.environments import spaces
+
+from rtd3jax.envs.interface import (
+    check_final_observation,
+    environment_name,
+    foreign_code,
+    trace_reset,
+    trace_step,
+)
+from rtd3jax.envs.registry import DISTURBANCES, make
+from rtd3jax.errors import UserError
+
+NAMESPACE = "rtd3jax"
+
+
+class GymnasiumEnv(gymnasium.Env):
+    """A gymnax environment behind Gymnasium's interface; made by `to_gymnasium`.
+
+    The reset and the step are compiled programs. ``step`` returns the final observation of an
+    episode and does not begin another; only ``reset`` does. A time limit is ``truncated``. ``info``
+    has what the environment put there, as numpy arrays.
+    """
+
+    metadata = {"render_modes": []}
+
+    def __init__(self, env: Any, params: Any = None) -> None:
+        self.world = env
+        self.params = env.default_params if params is None else params
+        self.action_space, self.observation_space = _spaces(env, self.params)
+        self._key: Any = None
+        self._state: Any = None
+        self._time = 0
+        self._over = True
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin an episode; a ``seed`` decides it and, without further seeds, all that follow."""
+        super().reset(seed=seed)
+        self._key = np.uint32(self.np_random.integers(2**32, dtype=np.uint32))
+        self._time, self._over = 0, False
+        observation, self._state = _reset(self.world, self.params, self._key)
+        return self._observation(observation), {}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """One step of the episode; gymnasium.error.ResetNeeded after its end."""
+        if self._over:
+            raise gymnasium.error.ResetNeeded("the episode is over, or none has begun: call reset")
+        action = np.asarray(action, self.action_space.dtype).reshape(self.action_space.shape)
+        time = np.uint32(self._time)
+        final, self._state, reward, terminated, truncated, info = _step(
+            self.world, self.params, self._key, time, self._state, action
+        )
+        self._time += 1
+        self._over = bool(terminated) or bool(truncated)
+        info = jax.tree.map(np.asarray, info)
+        return self._observation(final), float(reward), bool(terminated), bool(truncated), info
+
+    def _observation(self, observation: Any) -> np.ndarray:
+        return np.asarray(observation, self.observation_space.dtype)
+
+
+def to_gymnasium(env: Any, *, params: Any = None) -> GymnasiumEnv:
+    """Any gymnax >= 1.0 environment as a ``gymnasium.Env``, ours or anyone's, discrete or not.
+
+    ``gymnasium.make("rtd3jax/Rover-ar1-slip-v0", sigma=0.1)`` does the same by name, once rtd3jax
+    is imported; ``gymnasium.make("rtd3jax:rtd3jax/Rover-ar1-slip-v0")`` imports it.
+
+    Args:
+        env: the environment; its time limit is reported as ``truncated``.
+        params: its parameters; its own by default.
+
+    Raises:
+        UserError: for what is not a gymnax >= 1.0 environment.
+    """
+    return GymnasiumEnv(env, params)
+
+
+def make_gymnasium(env_id: str, disturbance: str, **parameters: Any) -> GymnasiumEnv:
+    """The entry point of the registered ids."""
+    return to_gymnasium(make(env_id, disturbance, **parameters))
+
+
+def gymnasium_id(env_id: str, disturbance: str) -> str:
+    """``rtd3jax/Pendulum-random-sine-v0`` for the pendulum's random-sine."""
+    return f"{NAMESPACE}/{env_id.capitalize()}-{disturbance}-v0"
+
+
+def register_with_gymnasium() -> None:
+    """Register every world with each of its disturbances; makes and imports nothing."""
+    for env_id, disturbances in DISTURBANCES.items():
+        for disturbance in disturbances:
+            if gymnasium_id(env_id, disturbance) not in gymnasium.registry:
+                gymnasium.register(
+                    id=gymnasium_id(env_id, disturbance),
+                    entry_point=f"{__name__}:make_gymnasium",
+                    kwargs={"env_id": env_id, "disturbance": disturbance},
+                )
+
+
+def _spaces(env: Any, params: Any) -> tuple[gymnasium.Space, gymnasium.Space]:
+    """Spaces of actions and observations; UserError for what is no gymnax >= 1.0 environment."""
+    name = environment_name(env)
+    for method in ("reset", "step", "action_space"):
+        if not callable(getattr(env, method, None)):
+            raise UserError(f"environment {name} has no method {method}: it is not a gymnax one")
+    with foreign_code():
+        actions = _gymnasium_space(name, "action", env.action_space(params))
+    observation, state = trace_reset(env, params)
+    action = jax.ShapeDtypeStruct(actions.shape or (), actions.dtype or jnp.float32)
+    after = trace_step(env, params, state, action)
+    if not hasattr(observation, "dtype"):
+        raise UserError(
+            f"environment {name}: the observation is a {type(observation).__name__}; "
+            "concatenate its parts into one array"
+        )
+    check_final_observation(name, after[-1], observation)
+    try:
+        with foreign_code():
+            seen = _gymnasium_space(name, "observation", env.observation_space(params))
+    except (AttributeError, NotImplementedError):
+        seen = gymnasium.spaces.Box(-np.inf, np.inf, observation.shape, np.float32)
+    if seen.shape != observation.shape:
+        raise UserError(
+            f"environment {name}: observation_space has shape {seen.shape}, "
+            f"the observation {observation.shape}; make them the same"
+        )
+    return actions, seen
+
+
+def _gymnasium_space(name: str, what: str, space: Any) -> gymnasium.Space:
+    if isinstance(space, spaces.Discrete):
+        return gymnasium.spaces.Discrete(int(space.n))
+    if not isinstance(space, spaces.Box):
+        raise UserError(
+            f"environment {name}: the {what} space {type(space).__name__} is neither Box nor "
+            f"Discrete; flatten the {what} into one Box"
+        )
+    dtype = np.dtype(space.dtype)
+    low, high = (
+        np.broadcast_to(np.asarray(bound, dtype), space.shape) for bound in (space.low, space.high)
+    )
+    return gymnasium.spaces.Box(low, high, tuple(space.shape), dtype.type)
+
+
+@functools.partial(jax.jit, static_argnames="env")
+def _reset(env: Any, params: Any, key: jax.Array) -> tuple[jax.Array, Any]:
+    with foreign_code():
+        return env.reset(jax.random.key(key), params)
+
+
+@functools.partial(jax.jit, static_argnames="env")
+def _step(
+    env: Any, params: Any, key: jax.Array, time: jax.Array, state: Any, action: jax.Array
+) -> tuple:
+    """The six values, with the observation before any automatic reset."""
+    # Apart from the key of reset, which draws from the episode's key itself.
+    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(key), 1 << 31), time)
+    with foreign_code():
+        _, state, reward, terminated, truncated, info = env.step(key, state, action, params)
+    final = info["final_observation"]
+    rest = {
+        name: value
+        for name, value in info.items()
+        if name not in ("final_observation", "terminated", "truncated")
+    }
+    return final, state, jnp.asarray(reward, jnp.float32), terminated, truncated, rest

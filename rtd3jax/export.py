@@ -1,0 +1,79 @@
+"""``python -m rtd3jax.export``: write a trained policy in a form that leaves the lab."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from rtd3jax.config import ALGORITHMS
+from rtd3jax.deploy.formats import FORMATS
+from rtd3jax.errors import UserError
+from rtd3jax.load import load_policy
+from rtd3jax.policy import Policy
+
+POLICY = "policy"
+"""The form that `rtd3jax.load_policy` reads."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; the exit status: 0 done, 2 bad input."""
+    options = _parser().parse_args(arguments)
+    try:
+        policy = load_policy(
+            options.run,
+            algorithm=options.agent,
+            seed=options.seed,
+            env=options.env,
+            disturbance=options.disturbance,
+            history_length=options.history_length,
+        )
+        path = Path(options.out or _default_name(policy, options))
+        if options.format == POLICY:
+            policy.save(path, overwrite=options.force)
+        else:
+            policy.export(path, options.format, overwrite=options.force)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(
+        f"{path}: {policy.algorithm} l={int(policy.history_length)}, "
+        f"{policy.observation_size} observation elements, actions of shape {policy.action_shape}, "
+        f"{path.stat().st_size:,} bytes"
+    )
+    return 0
+
+
+def _default_name(policy: Policy, options: argparse.Namespace) -> str:
+    suffix = ".safetensors" if options.format == POLICY else FORMATS[options.format][0]
+    if Path(options.run).is_dir():
+        stem = f"{policy.algorithm}_l{int(policy.history_length)}_seed-{options.seed or 0}"
+        # A module's name must be an identifier to be imported by name.
+        return (stem.replace("-", "_") if suffix == ".py" else stem) + suffix
+    return str(Path(options.run).with_suffix(suffix))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m rtd3jax.export",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog="example:\n"
+        "  python -m rtd3jax.export runs/quick --agent h-td3 --seed 0 --format onnx",
+    )
+    parser.add_argument("run", help="a run directory, or a file that policy.save wrote")
+    parser.add_argument(
+        "--format", required=True, choices=(*FORMATS, POLICY), help="the form of the file"
+    )
+    which = parser.add_argument_group("which lane of the run directory")
+    which.add_argument("--agent", choices=ALGORITHMS, help="the agent")
+    which.add_argument("--seed", type=int, help="the seed [0]")
+    which.add_argument("--env", help="where its lanes differ: the environment")
+    which.add_argument("--disturbance", help="the disturbance, as it was given to the sweep")
+    which.add_argument("--history-length", type=int, metavar="L", help="past steps in a window")
+    parser.add_argument("--out", metavar="FILE", help="the file [AGENT_lL_seed-N.SUFFIX, here]")
+    parser.add_argument("--force", action="store_true", help="replace the file if it exists")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,134 @@
+"""Policies from arrays that were written down: checked, then made whole."""
+
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rtd3jax.agents.networks import init_network, part_sizes
+from rtd3jax.agents.td3 import Bounds
+from rtd3jax.agents.variants import VARIANTS
+from rtd3jax.config import ALGORITHMS
+from rtd3jax.envs.interface import Interface
+from rtd3jax.errors import UserError
+from rtd3jax.files import flatten, read_arrays, unflatten
+from rtd3jax.policy import FORMAT, KIND, Policy
+
+
+def read_policy(path: str | os.PathLike) -> Policy:
+    """The policy that `Policy.save` wrote.
+
+    Raises:
+        UserError: when the file is missing, damaged, something else, of a newer format, or does not
+            hold the arrays that its header announces.
+    """
+    arrays, about = read_arrays(path)
+    if isinstance(about, dict) and "cell" in about and "seed" in about:
+        raise UserError(
+            f"{path} is a lane of a run directory and lacks the action's bounds: load it with "
+            f"load_policy({str(Path(path).parents[2])!r}, algorithm=..., seed={about['seed']})"
+        )
+    if not isinstance(about, dict) or about.get("kind") != KIND:
+        raise UserError(f"{path} is not a saved policy")
+    if about.get("format") != FORMAT:
+        raise UserError(
+            f"{path} has format {about.get('format')}, and this version of rtd3jax reads {FORMAT}: "
+            "use the version that wrote it, or a newer one"
+        )
+    interface, facts = _header(path, about)
+    return restore_policy(path, arrays, interface, **facts)
+
+
+def restore_policy(
+    path: str | os.PathLike,
+    actor: Mapping[str, np.ndarray],
+    interface: Interface,
+    *,
+    algorithm: str,
+    history_length: int,
+    width: int,
+) -> Policy:
+    """The policy of an actor's arrays under dotted names.
+
+    Args:
+        path: where they come from, for messages.
+        actor: the arrays.
+        interface: of the environment that the policy is for.
+        algorithm: the agent's id.
+        history_length: l; 0 for td3.
+        width: H.
+
+    Raises:
+        UserError: when an array is missing, too many, of another shape or type, or not finite.
+    """
+    spec = VARIANTS[algorithm].actor
+    sizes = part_sizes(interface.observation_size, interface.action_size)
+    shapes = jax.eval_shape(
+        lambda: init_network(jax.random.key(0), spec, sizes, width, interface.action_size)
+    )
+    expected = flatten(
+        jax.tree.map(lambda leaf: np.broadcast_to(np.float32(0), leaf.shape), shapes)
+    )
+    for name in sorted(expected.keys() ^ actor.keys()):
+        what = "lacks the array" if name in expected else "has an array too many:"
+        raise UserError(f"{path} does not fit {algorithm}: it {what} {name}")
+    for name, like in expected.items():
+        array = actor[name]
+        if array.shape != like.shape:
+            kind = "for another environment or width" if name.endswith("kernel") else "damaged"
+            raise UserError(
+                f"{path} does not fit {algorithm} with {interface.observation_size} observation "
+                f"elements, {interface.action_size} action elements and width {width}: {name} has "
+                f"shape {list(array.shape)}, not {list(like.shape)}; it is {kind}"
+            )
+        if array.dtype != np.float32:
+            raise UserError(f"{path}: {name} is {array.dtype}, not float32")
+        if not np.all(np.isfinite(array)):
+            raise UserError(f"{path}: the weights are not finite ({name})")
+    return Policy(
+        actor=jax.tree.map(jnp.asarray, unflatten(actor)),
+        bounds=Bounds(jnp.asarray(interface.action_low), jnp.asarray(interface.action_high)),
+        history_length=jnp.int32(history_length),
+        algorithm=algorithm,
+        tokens=history_length,
+        observation_size=interface.observation_size,
+        action_shape=interface.action_shape,
+    )
+
+
+def _header(path: str | os.PathLike, about: dict[str, Any]) -> tuple[Interface, dict[str, Any]]:
+    """What a file's header says, checked: the interface, and `restore_policy`'s other facts."""
+    wrong = f"{path} is damaged: its header's"
+    algorithm = about.get("algorithm")
+    if algorithm not in ALGORITHMS:
+        raise UserError(f"{wrong} algorithm is {algorithm!r}, not one of {', '.join(ALGORITHMS)}")
+    lowest = {"observation_size": 1, "hidden_size": 1, "history_length": algorithm != "td3"}
+    for name, least in lowest.items():
+        if not _is_count(about.get(name), int(least)):
+            raise UserError(f"{wrong} {name} is {about.get(name)!r}")
+    shape = about.get("action_shape")
+    if not isinstance(shape, list) or not all(_is_count(n, 1) for n in shape):
+        raise UserError(f"{wrong} action_shape is {shape!r}")
+    size = math.prod(shape)
+    try:
+        low, high = (np.asarray(about[f"action_{e}"], np.float32) for e in ("low", "high"))
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{wrong} action bounds are not numbers") from error
+    fit = low.shape == high.shape == (size,) and np.all(np.isfinite([low, high]))
+    if not fit or not np.all(low < high):
+        raise UserError(f"{wrong} action bounds are not {size} pairs of low < high")
+    interface = Interface(about["observation_size"], tuple(shape), size, low, high)
+    return interface, {
+        "algorithm": algorithm,
+        "history_length": about["history_length"],
+        "width": about["hidden_size"],
+    }
+
+
+def _is_count(value: Any, low: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and low <= value < 2**31

@@ -1,0 +1,95 @@
+"""What lanes need in memory, before anything is allocated, and how many fit at once."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+
+from rtd3jax.agents.networks import count_parameters
+from rtd3jax.config import Config
+from rtd3jax.errors import UserError
+from rtd3jax.training.lanes import Job
+
+_ARRAYS = {
+    "td3": 9,
+    "lstm-td3": 46,
+    "lstm-td3-no-action": 42,
+    "lstm-td3-1ha1hc": 40,
+    "lstm-td3-1ha2hc": 52,
+    "h-td3": 21,
+}
+"""Arrays of [l + 1, B, H] that are alive at an update's peak: what XLA reserves for the compiled
+loop on a CPU (`memory_analysis`), divided by their size; tests/study/test_memory.py compares."""
+
+_GRADIENTS = 0.75
+"""Copies of all parameters that are alive beside them."""
+
+_ACTING = 8
+"""Arrays of [l + 1, E, H] that are alive while E episodes are evaluated side by side."""
+
+_HEADROOM = 0.8
+"""Share of the memory that lanes may take: programs, tables and the rest need some too."""
+
+
+def state_bytes(job: Job) -> int:
+    """Bytes that a lane keeps: parameters, optimisers, replay, carries, environment; exact."""
+
+    def size(leaf: Any) -> int:
+        key = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        return leaf.size * (8 if key else leaf.dtype.itemsize)
+
+    return sum(map(size, jax.tree.leaves(jax.eval_shape(job.program.init, job.lane))))
+
+
+def working_bytes(config: Config, observation_size: int, action_size: int) -> int:
+    """Bytes that a lane needs beside its state while it advances: activations and gradients."""
+    tokens = (config.history_length or 0) + 1
+    array = 4 * tokens * config.hidden_size
+    counts = count_parameters(
+        config.algorithm, observation_size, action_size, hidden_size=config.hidden_size
+    )
+    gradients = 4 * (counts["actor"] + 2 * counts["critic"])
+    update = _ARRAYS[config.algorithm] * array * config.batch_size + _GRADIENTS * gradients
+    return int(max(update, _ACTING * array * config.eval_episodes))
+
+
+def job_bytes(jobs: Sequence[Job]) -> dict[Any, tuple[int, int]]:
+    """State and working bytes of a lane, by program."""
+    examples = {job.program: job for job in jobs}
+    return {
+        program: (
+            state_bytes(job),
+            working_bytes(
+                program.config,
+                program.observation_size,
+                job.program.bounds(job.lane).low.shape[0],
+            ),
+        )
+        for program, job in examples.items()
+    }
+
+
+def lanes_at_once(jobs: Sequence[Job], strategy: str, workers: int, memory: int) -> int:
+    """How many lanes fit in ``memory`` bytes: of a device under ``vmap``, of the machine else.
+
+    Under ``vmap`` all lanes of a device advance together; else as many as there are workers do, and
+    the others only keep their state.
+
+    Raises:
+        UserError: when not even one fits.
+    """
+    state, work = (max(sizes) for sizes in zip(*job_bytes(jobs).values(), strict=True))
+    usable = int(_HEADROOM * memory)
+    if strategy == "vmap":
+        fit = usable // (state + work)
+    else:
+        # A lane more than are meant to be: while a wave's last lane is trained, the next begins.
+        busy = min(workers, max(1, usable // (state + work)))
+        fit = (usable - busy * work) // state - (workers - 1)
+    if fit < 1 and state + work > usable:
+        raise UserError(
+            f"one lane needs {(state + work) / 2**30:,.1f} GiB and {usable / 2**30:,.1f} of the "
+            f"{memory / 2**30:,.1f} there are may be used; lower replay_capacity, hidden_size, "
+            "batch_size or history_length"
+        )
+    return max(1, fit)

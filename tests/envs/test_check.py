@@ -1,0 +1,287 @@
+"""One environment that is broken in one way, for every finding; and sound ones that pass."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+from gymnax.environments import environment, spaces
+
+from rtd3jax.envs.check import Finding, check_env, find_problems
+from rtd3jax.envs.registry import make
+from rtd3jax.errors import UserError
+
+
+@struct.dataclass
+class State:
+    time: jax.Array
+    position: jax.Array
+
+
+class Good(environment.Environment):
+    """A point that is pushed about; eight steps. The classes below break one thing each."""
+
+    @property
+    def default_params(self):
+        return environment.EnvParams(max_steps_in_episode=8)
+
+    def reset_env(self, key, params):
+        position = jax.random.uniform(key, (), jnp.float32, -0.5, 0.5)
+        return position[None], State(jnp.int32(0), position)
+
+    def step_env(self, key, state, action, params):
+        position = state.position + 0.1 * action[0]
+        state = State(state.time + jnp.int32(1), position)
+        return position[None], state, -(position**2), jnp.array(False), {}
+
+    def action_space(self, params):
+        return spaces.Box(-1.0, 1.0, (1,))
+
+    def observation_space(self, params):
+        return spaces.Box(-jnp.inf, jnp.inf, (1,))
+
+
+class HalfPrecision(Good):
+    def reset(self, key, params=None):
+        observation, state = super().reset(key, params)
+        return observation.astype(jnp.bfloat16), state
+
+
+class WiderState(Good):
+    def reset_env(self, key, params):
+        observation, state = super().reset_env(key, params)
+        return observation, state.replace(time=jnp.float32(0))
+
+    def step(self, key, state, action, params=None):
+        after, reset = self.step_env(key, state, action, params), jnp.array(False)
+        done = after[1].time >= 8
+        state = State(after[1].time.astype(jnp.int32), after[1].position)
+        return after[0], state, after[2], reset, done, {"final_observation": after[0]}
+
+
+class OtherState(Good):
+    def step(self, key, state, action, params=None):
+        observation, state, *rest = super().step(key, state, action, params)
+        return observation, (state,), *rest
+
+
+class OtherSpace(Good):
+    def observation_space(self, params):
+        return spaces.Box(-1.0, 1.0, (3,))
+
+
+class Callback(Good):
+    def step_env(self, key, state, action, params):
+        observation, *rest = super().step_env(key, state, action, params)
+        shape = jax.ShapeDtypeStruct((1,), jnp.float32)
+        return jax.pure_callback(lambda x: np.asarray(x), shape, observation), *rest
+
+
+class NotFinite(Good):
+    def step_env(self, key, state, action, params):
+        observation, state, _, terminated, info = super().step_env(key, state, action, params)
+        return observation, state, jnp.log(4.0 - state.time), terminated, info
+
+
+class NotFiniteAtReset(Good):
+    def reset_env(self, key, params):
+        observation, state = super().reset_env(key, params)
+        return observation / 0.0, state
+
+
+class Counting(Good):
+    """Keeps its own count of the calls, which a compiled program freezes."""
+
+    calls = 0
+
+    def step_env(self, key, state, action, params):
+        self.calls += 1
+        observation, *rest = super().step_env(key, state, action, params)
+        return observation + self.calls, *rest
+
+
+class NumpyRandom(Good):
+    def reset_env(self, key, params):
+        position = jnp.float32(np.random.default_rng().uniform())
+        return position[None], State(jnp.int32(0), position)
+
+
+class HostRandom(Good):
+    """A callback that gives another number at every call."""
+
+    def step_env(self, key, state, action, params):
+        observation, *rest = super().step_env(key, state, action, params)
+        shape = jax.ShapeDtypeStruct((1,), jnp.float32)
+        noise = jax.pure_callback(
+            lambda x: np.random.default_rng().normal(size=x.shape).astype(np.float32),
+            shape,
+            observation,
+            vmap_method="expand_dims",
+        )
+        return observation + noise, *rest
+
+
+class TimeLimitTerminates(Good):
+    def step_env(self, key, state, action, params):
+        observation, state, reward, _, info = super().step_env(key, state, action, params)
+        return observation, state, reward, state.time >= params.max_steps_in_episode, info
+
+
+class NamelessLimitTerminates(Good):
+    """Its limit is its own, and no parameter names it."""
+
+    @property
+    def default_params(self):
+        return ()
+
+    def step_env(self, key, state, action, params):
+        observation, state, reward, _, info = super().step_env(key, state, action, params)
+        return observation, state, reward, state.time >= 5, info
+
+    def is_truncated(self, state, params):
+        return jnp.array(False)
+
+
+class Endless(Good):
+    def is_truncated(self, state, params):
+        return jnp.array(False)
+
+
+class NextObservation(Good):
+    def step(self, key, state, action, params=None):
+        observation, *rest, info = super().step(key, state, action, params)
+        return observation, *rest, {**info, "final_observation": observation}
+
+
+class OldObservation(Good):
+    def step(self, key, state, action, params=None):
+        *rest, info = super().step(key, state, action, params)
+        return *rest, {**info, "final_observation": state.position[None]}
+
+
+@struct.dataclass
+class HiddenState(State):
+    bias: jax.Array
+
+
+class HiddenLeaks(Good):
+    """A wrapper's own reset, which forgets the hidden bias."""
+
+    def reset_env(self, key, params):
+        observation, state = super().reset_env(key, params)
+        bias = jax.random.normal(jax.random.fold_in(key, 1), ())
+        return observation + bias, HiddenState(state.time, state.position, bias)
+
+    def step_env(self, key, state, action, params):
+        observation, new, reward, terminated, info = super().step_env(key, state, action, params)
+        state = HiddenState(new.time, new.position, state.bias)
+        return observation + state.bias, state, reward, terminated, info
+
+    def step(self, key, state, action, params=None):
+        bias = state.bias
+        observation, state, *rest, info = super().step(key, state, action, params)
+        done = rest[1] | rest[2]
+        observation = jnp.where(done, observation - state.bias + bias, observation)
+        return observation, state.replace(bias=bias), *rest, info
+
+
+class Unbounded(Good):
+    def action_space(self, params):
+        return spaces.Box(-jnp.inf, jnp.inf, (1,))
+
+
+class VectorReward(Good):
+    def step_env(self, key, state, action, params):
+        observation, state, reward, terminated, info = super().step_env(key, state, action, params)
+        return observation, state, reward[None], terminated, info
+
+
+class NoFinalObservation(Good):
+    def step(self, key, state, action, params=None):
+        *rest, _ = super().step(key, state, action, params)
+        return *rest, {}
+
+
+BROKEN = [
+    (HalfPrecision, "dtype", "observation is bfloat16"),
+    (WiderState, "dtype", r"state.time is float32\[\] after reset and int32\[\] after step"),
+    (OtherState, "dtype", "different kinds of structure"),
+    (OtherSpace, "space", r"shape \(3,\), the observation \(1,\)"),
+    (Callback, "vmap", "vmap_method"),
+    (NotFinite, "finite", "reward of step 3 is not finite"),
+    (NotFiniteAtReset, "finite", "observation of reset"),
+    (Counting, "pure", "step gives another result"),
+    (NumpyRandom, "pure", "reset gives another result"),
+    (HostRandom, "pure", "step gives another result"),
+    (TimeLimitTerminates, "time-limit", "all 8 episodes terminate at step 8"),
+    (NamelessLimitTerminates, "time-limit", "all 8 episodes terminate at step 5"),
+    (Endless, "time-limit", "goes on after params.max_steps_in_episode = 8"),
+    (NextObservation, "final-observation", "next episode's first observation"),
+    (OldObservation, "final-observation", "though the episode goes on"),
+    (HiddenLeaks, "leak", "depends on the one before it"),
+    (Unbounded, "interface", "unbounded; give its Box finite low and high"),
+    (VectorReward, "interface", "reward must be a scalar"),
+    (NoFinalObservation, "interface", "info lacks 'final_observation'"),
+]
+
+
+@pytest.mark.parametrize(
+    ("broken", "kind", "match"), BROKEN, ids=lambda x: getattr(x, "__name__", "")
+)
+def test_what_is_broken_is_found_and_nothing_else(broken, kind, match):
+    with pytest.raises(UserError, match=match) as caught:
+        check_env(broken())
+    message = str(caught.value)
+    assert "\n" not in message and message.startswith(f"environment {broken.__name__}: ")
+    assert ";" in message, "a remedy"
+
+
+def test_every_kind_of_finding_has_a_broken_environment():
+    kinds = {"interface", "dtype", "space", "vmap", "finite", "pure", "leak", "final-observation"}
+    assert {kind for _, kind, _ in BROKEN} == kinds | {"time-limit"}
+
+
+def test_findings_name_their_kind():
+    (finding,) = find_problems(TimeLimitTerminates())
+    assert finding.kind == "time-limit" and "bootstrapping" in finding.remedy
+    assert str(Finding("pure", "this", "that")) == "this; that"
+
+
+def test_several_problems_are_listed_together():
+    class Poor(NotFinite, NextObservation):
+        pass
+
+    with pytest.raises(UserError, match="environment Poor has 2 problems:\n  1. the reward") as e:
+        check_env(Poor())
+    assert "\n  2. info['final_observation']" in str(e.value)
+
+    class Bad(VectorReward, NoFinalObservation):
+        pass
+
+    with pytest.raises(UserError, match="has 2 problems"):
+        check_env(Bad())
+
+
+@pytest.mark.parametrize(
+    ("env_id", "disturbance"),
+    [
+        ("rover", "ar1-slip+dropout"),
+        ("MountainCarContinuous-v0", "none"),
+    ],
+)
+def test_sound_environments_pass(env_id, disturbance):
+    check_env(make(env_id, disturbance, max_steps_in_episode=20))
+
+
+def test_a_termination_of_its_own_is_not_a_time_limit():
+    class Falls(Good):
+        def step_env(self, key, state, action, params):
+            observation, state, reward, _, info = super().step_env(key, state, action, params)
+            return observation, state, reward, jnp.abs(observation[0]) > 0.6, info
+
+    check_env(Falls())
+
+
+def test_no_environment_at_all():
+    with pytest.raises(UserError, match="no method reset"):
+        check_env(object())

@@ -1,0 +1,64 @@
+"""The memory plan against what XLA reserves, and how lanes are split when they do not fit."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import rtd3jax as rtd
+from rtd3jax.study import memory
+from rtd3jax.training.lanes import make_groups
+from rtd3jax.training.run import make_jobs
+
+
+def _jobs(seeds=1, **changes):
+    changes = {"algorithm": "td3", "total_steps": 2_000, **changes}
+    return make_jobs(rtd.make("rover", "ar1-slip"), rtd.Config(**changes), list(range(seeds)))
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "length"),
+    [("lstm-td3-1ha1hc", 8), ("lstm-td3-1ha2hc", 4), ("lstm-td3", 6), ("h-td3", 8)],
+)
+def test_the_plan_is_within_15_percent_of_what_xla_reserves(algorithm, length):
+    (job,) = _jobs(algorithm=algorithm, history_length=length, total_steps=10_000)
+    state = jax.eval_shape(job.program.init, job.lane)
+    step = jax.ShapeDtypeStruct((), jnp.int32)
+    advance = jax.jit(job.program.advance, donate_argnums=1)
+    options = {"xla_cpu_multi_thread_eigen": False}
+    used = advance.lower(job.lane, state, step, step).compile(options).memory_analysis()
+    kept, work = memory.job_bytes([job])[job.program]
+    assert abs(kept / used.output_size_in_bytes - 1) < 0.01
+    assert abs((kept + work) / (used.output_size_in_bytes + used.temp_size_in_bytes) - 1) < 0.15
+
+
+def test_lanes_that_do_not_fit_wait_for_their_turn():
+    jobs = _jobs(seeds=10)
+    kept, work = memory.job_bytes(jobs)[jobs[0].program]
+    need = (5 * kept + 2 * work) / 0.8
+    assert memory.lanes_at_once(jobs, "map", 2, int(need) + 1) == 4
+    assert memory.lanes_at_once(jobs, "vmap", 2, int(3.5 * (kept + work) / 0.8)) == 3
+    assert [g.wave for g in make_groups(jobs, "map", 2, 4)] == [0] * 4 + [1] * 4 + [2] * 2
+    groups = make_groups(jobs, "vmap", 1, 4)
+    assert [len(g.jobs) for g in groups] == [4, 4, 2] and [g.wave for g in groups] == [0, 1, 2]
+    with pytest.raises(rtd.UserError, match="one lane needs .* lower replay_capacity"):
+        memory.lanes_at_once(jobs, "map", 2, kept)
+
+
+def test_chunks_give_the_same_results():
+    from rtd3jax.training.lanes import advance_groups
+
+    jobs = _jobs(
+        seeds=3, hidden_size=4, batch_size=4, learning_starts=8, total_steps=24, eval_every=12
+    )
+    found = {}
+    for at_once in (None, 1, 2):
+        for strategy in ("map", "vmap"):
+            groups = make_groups(jobs, strategy, 1, at_once)
+            advance_groups(groups, lambda group: None)
+            found[strategy, at_once] = {
+                job.owner[1]: state.returns for g in groups for job, state in g.lanes()
+            }
+    for (strategy, _), returns in found.items():
+        for seed, curve in returns.items():
+            exact = found[strategy, None][seed]
+            assert jnp.allclose(curve, exact, rtol=0 if strategy == "map" else 1e-4)
