@@ -26,6 +26,7 @@ HYPERPARAMETERS = dict(
     critic_learning_rate=1e-3,
     final_learning_rate_fraction=1.0,
     gamma=0.9,
+    reward_scale=1.0,
     tau=0.1,
     exploration_noise=0.1,
     target_noise=0.4,

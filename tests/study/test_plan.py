@@ -1,5 +1,6 @@
 """The operations that a plan and the benchmark count are those that XLA counts."""
 
+import dataclasses
 import types
 
 import jax
@@ -26,7 +27,8 @@ def _counted(algorithm, length, width, batch_size):
     """XLA's count for a step's updates: products of any size, and elementwise operations."""
     variant = VARIANTS[algorithm]
     bounds = td3.Bounds(-jnp.ones(2), jnp.ones(2))
-    numbers = td3.Hyperparameters(*[jnp.float32(0.1)] * 8, history_length=jnp.int32(length))
+    numbers = {f.name: jnp.float32(0.1) for f in dataclasses.fields(td3.Hyperparameters)}
+    numbers = td3.Hyperparameters(**numbers | {"history_length": jnp.int32(length)})
 
     def inputs():
         replay = empty_replay(200, 2, 2, width if variant.stores_carry else None)
@@ -52,7 +54,7 @@ def _counted(algorithm, length, width, batch_size):
 
 @pytest.mark.parametrize("algorithm", VARIANTS)
 def test_operations_are_those_that_xla_counts(algorithm, monkeypatch):
-    monkeypatch.setattr(lstm, "lax", types.SimpleNamespace(scan=_unrolled))
+    monkeypatch.setattr(lstm, "lax", types.SimpleNamespace(**{**vars(jax.lax), "scan": _unrolled}))
     length = 0 if algorithm == "td3" else 2
     # Left out: narrow products and activations, which grow with H alone, and Adam's and Polyak's
     # arithmetic, which does not grow with the batch.
