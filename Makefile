@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: help venv sweep lint format test clean
+.PHONY: help venv sweep bench lint format test clean
 
 help:  ## these lines
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/:/'
@@ -16,6 +16,11 @@ venv: $(VENV)/.installed  ## the environment, at the tested versions
 
 sweep: venv  ## train td3, h-td3 and lstm-td3-1ha1hc on the slipping rover: the quick preset
 	$(BIN)/python -m rtd3jax.sweep --preset quick $(ARGS)
+
+bench: venv  ## how fast it is here, beside PyTorch: 20 minutes; the same command goes on
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]' \
+		|| echo "PyTorch cannot be installed here"
+	$(BIN)/python -m experiments.benchmarks.bench $(ARGS)
 
 lint: venv  ## formatting, lint, types
 	$(BIN)/ruff format --check .

@@ -154,23 +154,36 @@ def estimate(jobs: Sequence[Job], workers: int) -> Cost:
 
 
 def update_flops(config: Config) -> float:
-    """Operations of the products of one environment step's updates (forward = 1, backward = 2).
+    """Operations of the products of one environment step's updates, the delayed ones spread out.
 
-    Counts what grows with H squared; the narrow encoders are left out.
+    A layer's backward pass costs two forward passes, one for its weights and one for what it sends
+    back; nothing is sent back into an LSTM's first carry. Counts what grows with H squared: the
+    narrow products of the encoders and outputs are left out. tests/study/test_plan.py compares it
+    with XLA's own count.
     """
     variant, batch, width = VARIANTS[config.algorithm], config.batch_size, config.hidden_size
     token = 2.0 * batch * 2 * width * 4 * width
     layer = 2.0 * batch * width * width
 
-    def forward(spec: Any, past: bool = True) -> float:
-        tokens = int(spec.memory_has_current)
-        if spec.memory and past and not spec.carry_from_replay:
-            tokens += config.history_length or 0
-        return tokens * token + layer * (1 + bool(spec.memory and spec.current))
+    def head(spec: Any) -> float:
+        return layer * (1 + bool(spec.memory and spec.current))
 
-    actor, critic = forward(variant.actor), forward(variant.critic)
-    delayed = 3 * actor + critic + 2 * forward(variant.critic, past=False)
-    return actor + 2 * critic + 6 * critic + delayed / config.policy_delay
+    def forward(spec: Any) -> float:
+        tokens = int(spec.memory_has_current)
+        if spec.memory and not spec.carry_from_replay:
+            tokens += config.history_length or 0
+        return tokens * token + head(spec)
+
+    def backward(spec: Any) -> float:
+        return 2 * forward(spec) - 0.5 * token * bool(spec.memory)
+
+    actor, critic = variant.actor, variant.critic
+    to_action = head(critic)
+    if critic.memory_has_current and "action" in critic.memory:
+        to_action += 0.5 * token
+    critics = forward(actor) + 2 * forward(critic) + 2 * (forward(critic) + backward(critic))
+    delayed = forward(actor) + backward(actor) + forward(critic) + to_action
+    return critics + delayed / config.policy_delay
 
 
 def _matmul_rate(threads: int) -> float:

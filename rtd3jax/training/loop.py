@@ -197,9 +197,11 @@ class Program:
         final_observation = info["final_observation"].astype(jnp.float32)
         reward = reward.astype(jnp.float32)
         done = terminated.astype(bool) | truncated.astype(bool)
+        # Losses are not negative, and actions not above their bound.
+        never = (loss < 0.0) & jnp.all(action > bounds.high)
         replay = put_transition(
             replay,
-            step,
+            _after(step, never),
             Transition(
                 step=Steps(state.observation, state.previous_action, action),
                 reward=reward,
@@ -343,6 +345,24 @@ def make_lane(config: Config, seed: int, env_params: Any) -> Lane:
 
 def _array(leaf: Any) -> jax.Array:
     return jnp.asarray(leaf, jnp.float32 if isinstance(leaf, float) else None)
+
+
+@jax.custom_batching.custom_vmap
+def _after(number: jax.Array, never: jax.Array) -> jax.Array:
+    """``number``, but known only when ``never`` (always false) is.
+
+    A row that is written by it is written after what ``never`` was computed from has read the
+    ring. Where XLA sees no such order, it copies the whole ring at every step to be safe; an
+    optimization barrier does not tell it, since that is removed before copies are decided upon.
+    """
+    return number + never.astype(number.dtype)
+
+
+@_after.def_vmap
+def _after_of_lanes(axis_size, batched, number, never):
+    # One number for all lanes, lest the write become a scatter.
+    assert not batched[0]
+    return _after(number, jnp.any(never)), False
 
 
 def _keep_carry(replay: Replay, step: jax.Array, carry: Carry, age: jax.Array) -> Replay:

@@ -1,0 +1,168 @@
+"""What rtd3jax takes: lanes of the sweep's own compiled program, on the sweep's own workers."""
+
+import contextlib
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import rtd3jax as rtd
+from rtd3jax.training import lanes
+from rtd3jax.training.run import make_jobs
+
+# A measurement ends with the chunks under way, and begins with some of unknown pace: both must be
+# short beside it. What short chunks cost counts against us.
+_CHUNK_SECONDS, _FIRST_CHUNK = 0.2, 1
+
+
+def make_config(algorithm: str, history_length: int, **settings: Any) -> rtd.Config:
+    """A configuration without evaluations within reach."""
+    numbers = {"total_steps": 100_000_000, "eval_every": 100_000_000, "replay_capacity": 30_000}
+    length = None if algorithm == "td3" else history_length
+    settings = {**numbers, **settings}
+    settings.setdefault("learning_starts", settings.get("batch_size", 100))
+    return rtd.Config(algorithm=algorithm, history_length=length, **settings)
+
+
+class Lanes:
+    """Seeds of one configuration on the rover under AR(1) slip, to be run for a while at a time."""
+
+    def __init__(
+        self,
+        config: rtd.Config | Sequence[rtd.Config],
+        seeds: int,
+        *,
+        strategy: str = "map",
+        devices: int | None = None,
+        window: int | None = None,
+    ):
+        """``seeds`` lanes, dealt over the configurations in turn; ``window`` as in `make_jobs`."""
+        configs = [config] if isinstance(config, rtd.Config) else config
+        env = rtd.make("rover", "ar1-slip")
+        jobs = [
+            make_jobs(env, configs[seed % len(configs)], [seed], window=window)[0]
+            for seed in range(seeds)
+        ]
+        groups = lanes.make_groups(jobs, strategy, devices or len(lanes.workers()))
+        self.groups = [_Clocked(group.jobs) for group in groups]
+
+    def compile(self) -> float:
+        """Seconds until the first chunk's end: compiling, and milliseconds of random steps."""
+        began = time.perf_counter()
+        self._until(lambda: True)
+        return time.perf_counter() - began
+
+    def warm_up(self, seconds: float) -> float:
+        """Compile, and run for a while with updates; the seconds of `compile`."""
+        compiling = self.compile()
+        while min(group.step for group in self.groups) <= self._learning_starts:
+            self.run(seconds)
+        self.run(seconds)
+        return compiling
+
+    def run(self, seconds: float) -> tuple[int, float]:
+        """Seed-steps done, and seconds taken, in at least so many seconds.
+
+        The seconds are the workers' mean: each has its own last chunk, and waits after it.
+        """
+        before = self._steps()
+        for group in self.groups:
+            group.ends = {}
+        began = time.perf_counter()
+        self._until(lambda: time.perf_counter() - began >= seconds)
+        last: dict[int, float] = {}
+        for group in self.groups:
+            for worker, end in group.ends.items():
+                last[worker] = max(end, last.get(worker, end))
+        return self._steps() - before, float(np.mean(list(last.values()))) - began
+
+    def fill_replay(self, steps: int) -> None:
+        """As if ``steps`` steps had been done: random rows of 200-step episodes in every slot."""
+        random = np.random.default_rng(0)
+        for group in self.groups:
+            job = group.jobs[0]
+            state = job.program.init(job.lane)
+            # A key is no array of numbers, and the age bounds the windows.
+            rows = jax.tree.map(
+                lambda leaf: (
+                    jnp.asarray(random.standard_normal(leaf.shape, np.float32))
+                    if leaf.dtype == jnp.float32
+                    else leaf
+                ),
+                state.replay,
+            )
+            age = jnp.arange(rows.transitions.age.shape[0], dtype=jnp.int32) % 200
+            rows = rows.replace(transitions=rows.transitions.replace(age=age))
+            group.state, group.step = state.replace(replay=rows), steps
+
+    @property
+    def _learning_starts(self) -> int:
+        return self.groups[0].jobs[0].program.config.learning_starts
+
+    def _steps(self) -> int:
+        return sum(group.step * len(group.jobs) for group in self.groups)
+
+    def _until(self, enough: Any) -> None:
+        """Advance all groups until ``enough()`` after a chunk, and let what is under way end."""
+
+        def on_chunk(group: lanes.Group) -> None:
+            if group.error is not None:
+                raise group.error
+            if group.lost:
+                raise RuntimeError("a lane was lost: its losses are not finite")
+            if enough():
+                raise _Pause
+
+        with _short_chunks(), contextlib.suppress(_Pause):
+            lanes.advance_groups(self.groups, on_chunk)
+
+
+class _Clocked(lanes.Group):
+    """A group that knows when each worker last advanced it."""
+
+    ends: dict[int, float] = {}
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        super().__setattr__(name, value)
+        if name == "step":
+            self.ends = {**self.ends, threading.get_ident(): time.perf_counter()}
+
+
+class _Pause(Exception):
+    """Enough for now."""
+
+
+@contextlib.contextmanager
+def _short_chunks() -> Iterator[None]:
+    before = lanes.CHUNK_SECONDS, lanes._FIRST_CHUNK
+    lanes.CHUNK_SECONDS, lanes._FIRST_CHUNK = _CHUNK_SECONDS, _FIRST_CHUNK
+    try:
+        yield
+    finally:
+        lanes.CHUNK_SECONDS, lanes._FIRST_CHUNK = before
+
+
+def sgemm(size: int, seconds: float) -> tuple[float, float]:
+    """Operations done, and seconds: large products, each on one core, as many as workers."""
+    a = jnp.asarray(np.random.default_rng(0).standard_normal((size, size), np.float32))
+    options = {"xla_cpu_multi_thread_eigen": False}
+    product = jax.jit(jnp.matmul, compiler_options=options).lower(a, a).compile()
+    jax.block_until_ready(product(a, a))
+    done = [0] * len(lanes.workers())
+    began = time.perf_counter()
+
+    def work(worker: int) -> None:
+        while time.perf_counter() - began < seconds:
+            jax.block_until_ready(product(a, a))
+            done[worker] += 1
+
+    threads = [threading.Thread(target=work, args=(worker,)) for worker in range(len(done))]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return sum(done) * 2.0 * size**3, time.perf_counter() - began

@@ -1,0 +1,69 @@
+"""The operations that a plan and the benchmark count are those that XLA counts."""
+
+import dataclasses
+import types
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from rtd3jax.agents import lstm, td3
+from rtd3jax.agents.replay import empty_replay, gather
+from rtd3jax.agents.variants import VARIANTS
+from rtd3jax.config import Config
+from rtd3jax.study.plan import update_flops
+
+
+def _unrolled(f, carry, xs, reverse=False):
+    """`lax.scan` written out, because XLA counts a loop's body once."""
+    steps = range(jax.tree.leaves(xs)[0].shape[0])
+    ys = {}
+    for t in reversed(steps) if reverse else steps:
+        carry, ys[t] = f(carry, jax.tree.map(lambda x, t=t: x[t], xs))
+    return carry, jax.tree.map(lambda *rows: jnp.stack(rows), *(ys[t] for t in steps))
+
+
+def _counted(algorithm, length, width, batch_size):
+    """XLA's count for a step's updates: products of any size, and elementwise operations."""
+    variant = VARIANTS[algorithm]
+    bounds = td3.Bounds(-jnp.ones(2), jnp.ones(2))
+    numbers = {f.name: jnp.float32(0.1) for f in dataclasses.fields(td3.Hyperparameters)}
+    numbers = td3.Hyperparameters(**numbers | {"history_length": jnp.int32(length)})
+
+    def inputs():
+        replay = empty_replay(200, 2, 2, width if variant.stores_carry else None)
+        rows = jnp.zeros((batch_size,), jnp.int32)
+        return (
+            td3.init_learner(jax.random.key(0), variant, 2, 2, width),
+            gather(replay, rows, jnp.int32(5), length, length),
+        )
+
+    def critics(learner, batch):
+        key = jax.random.key(0)
+        return td3.update_critics(learner, variant, batch, key, numbers, bounds)
+
+    def actor(learner, batch):
+        return td3.update_actor_and_targets(learner, variant, batch, numbers, bounds)
+
+    count = [
+        jax.jit(update).lower(*jax.eval_shape(inputs)).cost_analysis()["flops"]
+        for update in (critics, actor)
+    ]
+    return count[0] + count[1] / Config.policy_delay
+
+
+@pytest.mark.parametrize("algorithm", VARIANTS)
+def test_operations_are_those_that_xla_counts(algorithm, monkeypatch):
+    monkeypatch.setattr(lstm, "lax", types.SimpleNamespace(**{**vars(jax.lax), "scan": _unrolled}))
+    length = 0 if algorithm == "td3" else 2
+    # Left out: narrow products and activations, which grow with H alone, and Adam's and Polyak's
+    # arithmetic, which does not grow with the batch.
+    for width, batch_size, left_out in ((128, 100, 0.07), (1024, 1000, 0.01)):
+        config = Config(
+            algorithm,
+            length or None,
+            hidden_size=width,
+            batch_size=batch_size,
+        )
+        ratio = _counted(algorithm, length, width, batch_size) / update_flops(config)
+        assert 1.0 <= ratio <= 1.0 + left_out, (width, ratio)
