@@ -29,8 +29,9 @@ from writing import RESULTS, markdown_table, provenance, write_results  # noqa: 
 STEPS = 20_000
 SETTINGS = {
     "gamma": 0.0,
-    "reward_scale": 100.0,
+    "reward_scale": 10.0,
     "final_learning_rate_fraction": 0.0,
+    "replay_capacity": 10_000,
     "precision": "float32",
 }
 HISTORY_LENGTH = 1
