@@ -102,15 +102,13 @@ def test_target_noise_is_clipped(problem):
     assert not np.allclose(wide, none)
 
 
-def test_critic_loss_sums_two_mean_squared_errors(problem):
+def test_the_loss_of_a_critic_is_its_mean_squared_error(problem):
     variant, learner, batch = problem
     y = jnp.linspace(-1.0, 1.0, B)
-    expected = sum(
-        np.mean((apply_network(c, variant.critic, batch.window, batch.action)[:, 0] - y) ** 2)
-        for c in learner.critics
-    )
-    got = td3.critic_loss(learner.critics, variant, batch, y)
-    np.testing.assert_allclose(got, expected, rtol=1e-5)
+    for critic in learner.critics:
+        value = apply_network(critic, variant.critic, batch.window, batch.action)[:, 0]
+        got = td3.critic_loss(critic, variant, batch, y)
+        np.testing.assert_allclose(got, np.mean((value - y) ** 2), rtol=1e-5)
 
 
 def test_the_actor_climbs_the_first_critic(problem):
@@ -133,20 +131,22 @@ def test_the_actor_climbs_the_first_critic(problem):
 def test_updates_are_adam_and_polyak(problem):
     variant, learner, batch = problem
     y = td3.target(learner, variant, batch, jax.random.key(2), _numbers(), BOUNDS)
+
+    def both(critics):
+        return sum(td3.critic_loss(critic, variant, batch, y) for critic in critics)
+
     updated, loss = td3.update_critics(
         learner, variant, batch, jax.random.key(2), _numbers(), BOUNDS
     )
     with jax.numpy_dtype_promotion("standard"):
         adam = optax.adam(2e-2)
-        gradient = jax.grad(td3.critic_loss)(learner.critics, variant, batch, y)
+        gradient = jax.grad(both)(learner.critics)
         steps, _ = adam.update(gradient, adam.init(learner.critics))
     expected = optax.apply_updates(learner.critics, steps)
     for a, b in zip(*map(jax.tree.leaves, (updated.critics, expected)), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)
     assert updated.actor is learner.actor and updated.target_critics is learner.target_critics
-    assert float(loss) == pytest.approx(
-        float(td3.critic_loss(learner.critics, variant, batch, y)), rel=1e-6
-    )
+    assert float(loss) == pytest.approx(float(both(learner.critics)), rel=1e-6)
 
     after = td3.update_actor_and_targets(updated, variant, batch, _numbers(), BOUNDS)
     triples = (
