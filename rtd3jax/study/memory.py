@@ -11,17 +11,17 @@ from rtd3jax.errors import UserError
 from rtd3jax.training.lanes import Job
 
 _ARRAYS = {
-    "td3": 9,
-    "lstm-td3": 46,
-    "lstm-td3-no-action": 42,
-    "lstm-td3-1ha1hc": 40,
-    "lstm-td3-1ha2hc": 52,
-    "h-td3": 21,
+    "td3": 5.0,
+    "lstm-td3": 21.5,
+    "lstm-td3-no-action": 21.0,
+    "lstm-td3-1ha1hc": 22.5,
+    "lstm-td3-1ha2hc": 22.5,
+    "h-td3": 19.0,
 }
 """Arrays of [l + 1, B, H] that are alive at an update's peak: what XLA reserves for the compiled
 loop on a CPU (`memory_analysis`), divided by their size; tests/study/test_memory.py compares."""
 
-_GRADIENTS = 0.75
+_GRADIENTS = 1.3
 """Copies of all parameters that are alive beside them."""
 
 _ACTING = 8

@@ -27,6 +27,12 @@ def test_the_rover_experiment_runs_and_says_what_is_missing(tmp_path, capsys):
     assert (out / "rover.png").stat().st_size > 5_000
     assert "-1.36 ± 0.04" in (out / "rover.md").read_text()
 
+    pictures = load(EXPERIMENTS / "rover_pictures.py")
+    assert pictures.main(["--quick", "--run", str(run), "--out", str(out)]) == 0
+    assert "missing: " in capsys.readouterr().out
+    assert (out / "rover_inferred_slip.png").exists()
+    assert (out / "rover_drive.gif").read_bytes().startswith(b"GIF")
+
 
 @pytest.mark.parametrize("name", ["slip_distributions", "parameter_counts"])
 def test_small_experiments_run(name, tmp_path):
