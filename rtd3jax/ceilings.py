@@ -3,6 +3,9 @@
 Rover (spec section 6): slip is exogenous and the motion has no memory, so the best policy is
 myopic. The last action and the observation give the realised slip exactly; the best command then
 minimises the expected squared error under the conditional moments of the next slip.
+
+Pendulum: the fully observable optimum, by `rtd3jax.value_iteration`; it bounds every disturbed case
+from above.
 """
 
 from typing import Any, NamedTuple
@@ -13,11 +16,14 @@ import numpy as np
 from flax import struct
 from jax.scipy.stats import norm
 
+from rtd3jax.envs.disturbed import Disturbed
+from rtd3jax.envs.pendulum import Pendulum
 from rtd3jax.envs.process import Nothing, Process
 from rtd3jax.envs.rover import Rover, RoverParams
 from rtd3jax.envs.slip import WHEELS, Ar1Slip, SineSlip
 from rtd3jax.errors import UserError
 from rtd3jax.evaluate import evaluate
+from rtd3jax.value_iteration import mean_optimal_return
 
 
 class Ceiling(NamedTuple):
@@ -101,12 +107,31 @@ def ceiling(env: Any, episodes: int = 20_000, seed: int = 0) -> Ceiling:
     Raises:
         UserError: for a world whose ceiling is not known.
     """
+    if isinstance(env, Pendulum | Disturbed):
+        return _pendulum_bound(env, episodes, seed)
     if not isinstance(env, Rover):
-        raise UserError("the ceiling is known for the rover alone")
+        raise UserError("the ceiling is known for the rover and the pendulum alone")
     if isinstance(env.default_params.slip, SineSlip):
         return _sine_bound(env.default_params, episodes, seed)
     returns = np.asarray(evaluate(bayes_policy(env), env, episodes, seed), np.float64)
     return Ceiling(float(returns.mean()), float(returns.std(ddof=1) / np.sqrt(episodes)), "exact")
+
+
+def _pendulum_bound(env: Any, episodes: int, seed: int) -> Ceiling:
+    """The undisturbed optimum: no disturbed pendulum can do better by its true state's reward."""
+    params, disturbed = env.default_params, False
+    if isinstance(env, Disturbed):
+        if not isinstance(env.base, Pendulum):
+            raise UserError("the ceiling is known for the rover and the pendulum alone")
+        if env.reward_from != "state" or not isinstance(params.reward, Nothing):
+            raise UserError(
+                "a reward that is itself disturbed has no known ceiling; "
+                "make the environment with reward_from='state'"
+            )
+        disturbed = not (isinstance(params.process, Nothing) and isinstance(params.action, Nothing))
+        params = params.env
+    mean, error = mean_optimal_return(params, episodes, seed)
+    return Ceiling(mean, error, "upper bound" if disturbed else "exact")
 
 
 def _sine_bound(params: RoverParams, episodes: int, seed: int) -> Ceiling:

@@ -17,6 +17,7 @@ LAYERS = {
     "agents": 2,
     "deploy": 2,
     "policy": 3,
+    "value_iteration": 3,
     "evaluate": 4,
     "saved": 4,
     "play_gymnasium": 4,
