@@ -1,0 +1,113 @@
+"""The fast path against the straightforward one, over 200 updates."""
+
+import jax
+import jax.numpy as jnp
+import optax
+import pytest
+
+from rtd3jax.agents import lstm as fast
+from rtd3jax.agents import networks, td3
+from rtd3jax.agents.networks import apply_network
+from rtd3jax.agents.replay import Batch
+from rtd3jax.agents.variants import VARIANTS
+from rtd3jax.agents.windows import Steps, Window
+
+B, L, WIDTH, UPDATES = 8, 3, 8, 200
+BOUNDS = td3.Bounds(jnp.array([-2.0]), jnp.array([2.0]))
+NUMBERS = td3.Hyperparameters(
+    *(jnp.float32(x) for x in (1e-3, 1e-3, 1.0, 0.9, 1.0, 0.005, 0.1, 0.2, 0.5)),
+    history_length=jnp.int32(L),
+)
+
+
+def _window(key, length):
+    a, b, c, d, e = jax.random.split(key, 5)
+    shapes = ((L, B, 3), (L, B, 1), (L, B, 1))
+    past = Steps(*(jax.random.normal(k, s) for k, s in zip((a, b, c), shapes, strict=True)))
+    return Window(past, length, jax.random.normal(d, (B, 3)), jax.random.normal(e, (B, 1)))
+
+
+def _batch(key):
+    a, b, c, d, e, f = jax.random.split(key, 6)
+    length = jax.random.randint(a, (B,), 0, L + 1)
+    return Batch(
+        window=_window(b, length),
+        action=jax.random.uniform(c, (B, 1), minval=-2.0, maxval=2.0),
+        reward=jax.random.normal(d, (B,)),
+        next_window=_window(e, jnp.minimum(length + 1, L)),
+        terminated=jax.random.bernoulli(f, 0.1, (B,)),
+        carry=None,
+        next_carry=None,
+    )
+
+
+def _straightforward(learner, variant, batch, key):
+    """One step of TD3 as one writes it down: joint losses, automatic differentiation, optax."""
+    y = td3.target(learner, variant, batch, key, NUMBERS, BOUNDS)
+
+    def critics_loss(critics):
+        values = [apply_network(c, variant.critic, batch.window, batch.action) for c in critics]
+        return sum(jnp.mean((value[:, 0] - y) ** 2) for value in values)
+
+    def actor_loss(actor):
+        action = td3.act(actor, variant, batch.window, BOUNDS)
+        return -jnp.mean(apply_network(critics[0], variant.critic, batch.window, action))
+
+    adam = optax.scale_by_adam()
+
+    def descend(params, gradient, state):
+        with jax.numpy_dtype_promotion("standard"):
+            direction, state = adam.update(gradient, state)
+        return jax.tree.map(lambda p, d: p - 1e-3 * d, params, direction), state
+
+    def average(online, target):
+        return jax.tree.map(lambda o, t: 0.995 * t + 0.005 * o, online, target)
+
+    critics, critic_state = descend(
+        learner.critics, jax.grad(critics_loss)(learner.critics), learner.critic_optimizer
+    )
+    actor, actor_state = descend(
+        learner.actor, jax.grad(actor_loss)(learner.actor), learner.actor_optimizer
+    )
+    return td3.Learner(
+        actor=actor,
+        critics=critics,
+        target_actor=average(actor, learner.target_actor),
+        target_critics=average(critics, learner.target_critics),
+        actor_optimizer=actor_state,
+        critic_optimizer=critic_state,
+    )
+
+
+def _fast(learner, variant, batch, key):
+    learner, _ = td3.update_critics(learner, variant, batch, key, NUMBERS, BOUNDS)
+    return td3.update_actor_and_targets(learner, variant, batch, NUMBERS, BOUNDS)
+
+
+def _reference_lstm(params, inputs, exists, carry, precision="float32"):
+    return fast.reference(params, inputs, exists, carry)
+
+
+@pytest.mark.parametrize("algorithm", ["lstm-td3", "lstm-td3-1ha1hc"])
+def test_200_updates_agree_to_float32_rounding(algorithm, monkeypatch):
+    variant = VARIANTS[algorithm]
+
+    def train(update):
+        def step(learner, key):
+            batch_key, noise_key = jax.random.split(key)
+            return update(learner, variant, _batch(batch_key), noise_key), None
+
+        learner = td3.init_learner(jax.random.key(0), variant, 3, 1, WIDTH)
+        keys = jax.random.split(jax.random.key(1), UPDATES)
+        return jax.jit(lambda first: jax.lax.scan(step, first, keys)[0])(learner), learner
+
+    quick, start = train(_fast)
+    monkeypatch.setattr(networks, "lstm", _reference_lstm)
+    slow, _ = train(_straightforward)
+
+    def farthest(one, other):
+        pairs = zip(*(jax.tree.leaves((x.actor, x.critics)) for x in (one, other)), strict=True)
+        return max(float(jnp.abs(a - b).max()) for a, b in pairs)
+
+    assert farthest(quick, start) > 0.1
+    assert farthest(quick, slow) < 2e-6
