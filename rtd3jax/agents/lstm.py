@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from rtd3jax.agents.products import narrow, product, weight_gradient
+from rtd3jax.agents.products import matmul, narrow, product, weight_gradient
 
 Params = dict[str, jax.Array]
 
@@ -53,7 +53,7 @@ def lstm(
     params: Params,
     inputs: jax.Array,
     exists: jax.Array,
-    carry: Carry,
+    carry: Carry | None = None,
     precision: str = "float32",
 ) -> Carry:
     """The carry after all tokens.
@@ -64,18 +64,20 @@ def lstm(
         exists: bool [T, B]. A token that does not exist leaves the carry as it was, **provided**
             that it stands before all that exist and that its carry is zero, as in a window: the
             candidate is then masked, which keeps a zero carry zero at no cost.
-        carry: what the LSTM starts from.
+        carry: what the LSTM starts from; None for zero.
         precision: of the products' factors; see `rtd3jax.agents.products`.
     """
-    return _lstm(
-        precision,
-        params["input_kernel"],
-        params["recurrent_kernel"],
-        params["input_bias"] + params["recurrent_bias"],
-        inputs,
-        exists,
-        carry,
-    )
+    input_kernel, recurrent_kernel = params["input_kernel"], params["recurrent_kernel"]
+    bias = params["input_bias"] + params["recurrent_bias"]
+    if carry is None:
+        # Without a carry the first token needs no recurrent product: a quarter of all at l = 1.
+        gates = matmul(inputs[0], input_kernel, precision) + bias[None, :]
+        nothing = zero_carry(inputs.shape[1], recurrent_kernel.shape[0]).cell
+        carry = _cell(_activate(gates, exists[0]), nothing.astype(gates.dtype))
+        inputs, exists = inputs[1:], exists[1:]
+    if inputs.shape[0] == 0:
+        return carry
+    return _lstm(precision, input_kernel, recurrent_kernel, bias, inputs, exists, carry)
 
 
 def reference(params: Params, inputs: jax.Array, exists: jax.Array, carry: Carry) -> Carry:

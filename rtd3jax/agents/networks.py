@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from rtd3jax.agents.lstm import Carry, init_lstm, lstm, zero_carry
+from rtd3jax.agents.lstm import Carry, init_lstm, lstm
 from rtd3jax.agents.products import matmul
 from rtd3jax.agents.variants import VARIANTS, NetworkSpec
 from rtd3jax.agents.windows import Steps, Window
@@ -51,10 +51,8 @@ def init_network(
 
 def carry_before(params: Params, spec: NetworkSpec, window: Window) -> Carry:
     """The LSTM's carry after the window's past tokens, before the current one."""
-    width = params["lstm"]["recurrent_kernel"].shape[0]
-    start = zero_carry(window.length.shape[0], width)
     encoded = _encode(params, _past_tokens(spec, window))
-    return lstm(params["lstm"], encoded, window.exists, start, spec.precision)
+    return lstm(params["lstm"], encoded, window.exists, precision=spec.precision)
 
 
 def apply_network(
@@ -131,8 +129,7 @@ def _memory(
         return lstm(params["lstm"], encoded, present, carry, spec.precision).hidden
     tokens = jnp.concatenate((_past_tokens(spec, window), current))
     exists = jnp.concatenate((window.exists, present))
-    start = zero_carry(current.shape[1], params["lstm"]["recurrent_kernel"].shape[0])
-    return lstm(params["lstm"], _encode(params, tokens), exists, start, spec.precision).hidden
+    return lstm(params["lstm"], _encode(params, tokens), exists, precision=spec.precision).hidden
 
 
 def _past_tokens(spec: NetworkSpec, window: Window) -> jax.Array:

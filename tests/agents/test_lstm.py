@@ -26,18 +26,20 @@ def float64():
         yield
 
 
-def test_forward_equals_reference():
+@pytest.mark.parametrize("tokens", [1, 2, TOKENS])
+@pytest.mark.parametrize("start", [None, zero_carry(BATCH, WIDTH)])
+def test_forward_equals_reference(tokens, start):
     params, inputs, exists, _ = _problem(jnp.float32)
-    start = zero_carry(BATCH, WIDTH)
-    for fast, slow in zip(
-        lstm(params, inputs, exists, start), reference(params, inputs, exists, start), strict=True
-    ):
-        np.testing.assert_allclose(fast, slow, atol=1e-6)
+    inputs, exists = inputs[-tokens:], exists[-tokens:]
+    slow = reference(params, inputs, exists, zero_carry(BATCH, WIDTH))
+    for a, b in zip(lstm(params, inputs, exists, start), slow, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-6)
 
 
-def test_a_window_without_tokens_leaves_the_carry_zero():
+@pytest.mark.parametrize("start", [None, zero_carry(BATCH, WIDTH)])
+def test_a_window_without_tokens_leaves_the_carry_zero(start):
     params, inputs, exists, _ = _problem(jnp.float32)
-    hidden, cell = lstm(params, inputs, exists, zero_carry(BATCH, WIDTH))
+    hidden, cell = lstm(params, inputs, exists, start)
     assert not np.any(hidden[0]) and not np.any(cell[0])
     assert np.all(hidden[1] != 0)
 
@@ -53,7 +55,10 @@ def test_masked_tokens_do_not_matter():
 
 
 @pytest.mark.parametrize("from_zero", [True, False])
-def test_gradient_equals_automatic_differentiation(float64, from_zero):
+@pytest.mark.parametrize("implied", [True, False])
+def test_gradient_equals_automatic_differentiation(float64, from_zero, implied):
+    if implied and not from_zero:
+        pytest.skip("only a zero carry is implied")
     params, inputs, exists, weights = _problem(jnp.float64)
     start = Carry(*(weights * (0.0 if from_zero else 1.0)))
     if not from_zero:  # a stored carry is followed by tokens that all exist
@@ -61,7 +66,8 @@ def test_gradient_equals_automatic_differentiation(float64, from_zero):
 
     def loss(function):
         def of(params, inputs, start):
-            end = function(params, inputs, exists, start)
+            carry = None if implied and function is lstm else start
+            end = function(params, inputs, exists, carry)
             return jnp.sum(end.hidden * weights[0]) + jnp.sum(end.cell * weights[1] ** 2)
 
         return jax.grad(of, argnums=(0, 1, 2) if not from_zero else (0, 1))(params, inputs, start)
