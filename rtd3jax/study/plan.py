@@ -157,7 +157,8 @@ def update_flops(config: Config) -> float:
     """Operations of the products of one environment step's updates, the delayed ones spread out.
 
     A layer's backward pass costs two forward passes, one for its weights and one for what it sends
-    back; nothing is sent back into an LSTM's first carry. Counts what grows with H squared: the
+    back. A window's first token has no carry and so no recurrent product; nothing is sent back into
+    a carry from the replay. Counts what grows with H squared: the
     narrow products of the encoders and outputs are left out. tests/study/test_plan.py compares it
     with XLA's own count.
     """
@@ -169,13 +170,14 @@ def update_flops(config: Config) -> float:
         return layer * (1 + bool(spec.memory and spec.current))
 
     def forward(spec: Any) -> float:
-        tokens = int(spec.memory_has_current)
+        tokens = float(spec.memory_has_current)
         if spec.memory and not spec.carry_from_replay:
-            tokens += config.history_length or 0
+            # The first token's input product alone.
+            tokens += (config.history_length or 0) - 0.5
         return tokens * token + head(spec)
 
     def backward(spec: Any) -> float:
-        return 2 * forward(spec) - 0.5 * token * bool(spec.memory)
+        return 2 * forward(spec) - 0.5 * token * spec.carry_from_replay
 
     actor, critic = variant.actor, variant.critic
     to_action = head(critic)

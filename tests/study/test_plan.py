@@ -23,6 +23,11 @@ def _unrolled(f, carry, xs, reverse=False):
     return carry, jax.tree.map(lambda *rows: jnp.stack(rows), *(ys[t] for t in steps))
 
 
+def _mapped(f, xs):
+    """`lax.map` written out, likewise."""
+    return _unrolled(lambda _, x: (None, f(x)), None, xs)[1]
+
+
 def _counted(algorithm, length, width, batch_size):
     """XLA's count for a step's updates: products of any size, and elementwise operations."""
     variant = VARIANTS[algorithm]
@@ -55,6 +60,7 @@ def _counted(algorithm, length, width, batch_size):
 @pytest.mark.parametrize("algorithm", VARIANTS)
 def test_operations_are_those_that_xla_counts(algorithm, monkeypatch):
     monkeypatch.setattr(lstm, "lax", types.SimpleNamespace(**{**vars(jax.lax), "scan": _unrolled}))
+    monkeypatch.setattr(td3, "lax", types.SimpleNamespace(**{**vars(jax.lax), "map": _mapped}))
     length = 0 if algorithm == "td3" else 2
     # Left out: narrow products and activations, which grow with H alone, and Adam's and Polyak's
     # arithmetic, which does not grow with the batch.
