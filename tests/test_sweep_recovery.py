@@ -92,7 +92,8 @@ sys.exit(sweep.main(sys.argv[3:]))
 
 
 @pytest.mark.parametrize(
-    ("part", "times"), [("step-", 30), ("seed-1.safetensors", 1), ("episodes.parquet", 1)]
+    ("part", "times"),
+    [("config.json", 1), ("step-", 30), ("seed-1.safetensors", 1), ("episodes.parquet", 1)],
 )
 def test_killed_while_it_writes(part, times, whole, tmp_path):
     out = tmp_path / "run"

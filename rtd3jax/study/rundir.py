@@ -101,7 +101,7 @@ class RunDirectory:
             if config.exists():
                 self._check_same(config)
                 return
-            if any(not entry.name.startswith(".lock") for entry in self.path.iterdir()):
+            if not all(map(_is_own, self.path.iterdir())):
                 raise UserError(
                     f"--out {self.path} is not empty and holds no study; choose another directory"
                 )
@@ -300,6 +300,15 @@ class RunDirectory:
             "final episodes per seed": self._study["final_episodes"],
             **common,
         }
+
+
+def _is_own(entry: Path) -> bool:
+    """Whether this may stand in a directory before its study does.
+
+    A lock, or what a process left that was killed while it wrote the configuration.
+    """
+    half_written = entry.name.startswith(".config.json.") and entry.name.endswith(".tmp")
+    return entry.name.startswith(".lock") or half_written
 
 
 def _read_study(config: Path) -> Any:
