@@ -45,7 +45,7 @@ def main(arguments: list[str] | None = None) -> None:
     quick = parser.parse_args(arguments).quick
     print("| agent | replay | MiB | seconds | overhead |\n|---|---|---|---|---|")
     for capacity in (1_000,) if quick else (30_000, 1_000_000):
-        for algorithm in ("td3", "lstm-td3-1ha1hc", "h-td3"):
+        for algorithm in ("h-td3",) if quick else ("td3", "lstm-td3-1ha1hc", "h-td3"):
             seconds, size = seconds_to_write(algorithm, capacity, 1 if quick else 7)
             interval = max(DEFAULT_SECONDS, _PATIENCE * seconds)
             share = LANES * seconds / (CORES * interval)
