@@ -25,14 +25,22 @@ STUDY = [
 ]
 
 
-def command(out: pathlib.Path) -> list[str]:
-    return [sys.executable, "-m", "rtd3jax.sweep", *STUDY, "--out", str(out)]
+QUICK = ["--total-steps", "1500"]
 
 
-def run(out: pathlib.Path, environment: dict[str, str], kill_after: float | None = None) -> bool:
+def command(out: pathlib.Path, more: list[str]) -> list[str]:
+    return [sys.executable, "-m", "rtd3jax.sweep", *STUDY, *more, "--out", str(out)]
+
+
+def run(
+    out: pathlib.Path,
+    environment: dict[str, str],
+    more: list[str],
+    kill_after: float | None = None,
+) -> bool:
     """Run the sweep; whether it was killed."""
     with subprocess.Popen(
-        command(out),
+        command(out, more),
         env=environment,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
@@ -58,27 +66,27 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="1 trial")
     parser.add_argument("--trials", type=int, default=50)
     options = parser.parse_args(arguments)
-    trials = 1 if options.quick else options.trials
+    trials, more = (1, QUICK) if options.quick else (options.trials, [])
     chance = random.Random(0)
     with tempfile.TemporaryDirectory() as name:
         root = pathlib.Path(name)
         environment = {
-            **os.environ,
             "JAX_COMPILATION_CACHE_DIR": str(root / "cache"),
             "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+            **os.environ,
         }
         if not options.quick:  # so that `life` has no compiling in it
-            run(root / "warm", environment)
+            run(root / "warm", environment, more)
         began = time.perf_counter()
-        run(root / "whole", environment)
+        run(root / "whole", environment, more)
         life = time.perf_counter() - began
         expected = contents(root / "whole")
         same = kills = 0
         for trial in range(trials):
             out = root / f"trial-{trial}"
             for _ in range(chance.choice((1, 2, 2))):
-                kills += run(out, environment, kill_after=chance.uniform(0.3, 1.0) * life)
-            run(out, environment)
+                kills += run(out, environment, more, kill_after=chance.uniform(0.3, 1.0) * life)
+            run(out, environment, more)
             same += contents(out) == expected
             print(f"{same} of {trial + 1} bit-identical after {kills} kills", flush=True)
     return 0 if same == trials else 1

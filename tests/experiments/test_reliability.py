@@ -3,6 +3,7 @@
 import importlib.util
 import pathlib
 
+import jax
 import pytest
 
 EXPERIMENTS = pathlib.Path(__file__).parents[2] / "experiments"
@@ -25,7 +26,8 @@ def test_the_cost_of_checkpoints(capsys):
     assert capsys.readouterr().out.count("%") == 1
 
 
-def test_killed_sweeps_resume_to_the_same_bits():
+def test_killed_sweeps_resume_to_the_same_bits(monkeypatch):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", jax.config.jax_compilation_cache_dir)
     assert load(EXPERIMENTS / "reliability" / "kill_and_resume.py").main(["--quick"]) == 0
 
 

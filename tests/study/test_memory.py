@@ -48,10 +48,10 @@ def test_chunks_give_the_same_results():
     from rtd3jax.training.lanes import advance_groups
 
     jobs = _jobs(
-        seeds=3, hidden_size=4, batch_size=4, learning_starts=8, total_steps=24, eval_every=12
+        seeds=2, hidden_size=4, batch_size=4, learning_starts=8, total_steps=24, eval_every=12
     )
     found = {}
-    for at_once in (None, 1, 2):
+    for at_once in (None, 1):
         for strategy in ("map", "vmap"):
             groups = make_groups(jobs, strategy, 1, at_once)
             advance_groups(groups, lambda group: None)
