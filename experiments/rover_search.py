@@ -25,6 +25,7 @@ BASE = {
     "total_steps": 20_000,
     "batch_size": 100,
     "learning_rate": 1e-3,
+    "actor_rate": 1.0,
     "final_learning_rate_fraction": 1.0,
     "gamma": 0.99,
     "exploration_noise": 0.1,
@@ -68,13 +69,26 @@ CHANGES: tuple[dict, ...] = (
     {"final_learning_rate_fraction": 0.0, "gamma": 0.0, "replay_capacity": 10_000},
     {"final_learning_rate_fraction": 0.0, "gamma": 0.0, "reward_scale": 100.0},
     {"final_learning_rate_fraction": 0.0, "gamma": 0.0, "reward_scale": 10.0},
-    {
-        "final_learning_rate_fraction": 0.0,
-        "gamma": 0.0,
-        "reward_scale": 100.0,
-        "precision": "bfloat16",
-        "train_on": "sine-slip",
-    },
+    *(
+        {
+            "final_learning_rate_fraction": 0.0,
+            "gamma": 0.0,
+            "reward_scale": 10.0,
+            "replay_capacity": 10_000,
+            **more,
+        }
+        for more in (
+            {"exploration_noise": 0.05},
+            # A slower actor averages over the critic's wandering optimum.
+            {"learning_rate": 3e-3, "actor_rate": 0.1},
+            {"learning_rate": 3e-3, "actor_rate": 0.1, "replay_capacity": 100_000},
+            {"learning_rate": 3e-3, "actor_rate": 0.03},
+            {"learning_rate": 1e-2, "actor_rate": 0.03},
+            {"learning_rate": 3e-3, "actor_rate": 0.1, "total_steps": 40_000},
+            {"precision": "bfloat16"},
+            {"train_on": "sine-slip"},
+        )
+    ),
 )
 """What each setting changes in `BASE`."""
 
@@ -86,7 +100,7 @@ def search(setting: dict, width: int, episodes: int) -> dict:
     config = rtd.Config(
         algorithm="lstm-td3-1ha1hc",
         hidden_size=width,
-        actor_learning_rate=setting["learning_rate"],
+        actor_learning_rate=setting["learning_rate"] * setting["actor_rate"],
         critic_learning_rate=setting["learning_rate"],
         **fields,
     )
@@ -105,7 +119,7 @@ def search(setting: dict, width: int, episodes: int) -> dict:
     }
 
 
-RTD_FIELDS = set(BASE) - {"train_on", "learning_rate"}
+RTD_FIELDS = set(BASE) - {"train_on", "learning_rate", "actor_rate"}
 
 
 def main(arguments: list[str] | None = None) -> None:

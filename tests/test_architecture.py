@@ -26,6 +26,8 @@ LAYERS = {
     "study": 6,
     "load": 7,
     "sweep": 7,
+    "report": 7,
+    "transfer": 7,
     "export": 8,
 }
 

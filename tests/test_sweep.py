@@ -9,6 +9,7 @@ import pytest
 from rtd3jax import sweep
 from rtd3jax.config import Config
 from rtd3jax.envs import registry
+from rtd3jax.study import recorder, references
 from rtd3jax.study.plan import PRESETS, Cell, make_cells
 from rtd3jax.study.results import CURVES, EPISODES, read_table
 
@@ -22,16 +23,20 @@ TINY = [
 
 @pytest.fixture(autouse=True)
 def few_reference_episodes(monkeypatch):
-    monkeypatch.setattr(sweep, "REFERENCE_EPISODES", 2)
+    monkeypatch.setattr(references, "EPISODES", 2)
+    monkeypatch.setattr(sweep, "refresh_page", lambda *_, **__: None)
 
 
 def _files(directory, *names):
     return [(directory / name).read_bytes() for name in names]
 
 
-def test_a_run_directory_holds_what_it_should(tmp_path, capsys):
+def test_a_run_directory_holds_what_it_should(tmp_path, capsys, monkeypatch):
     out = tmp_path / "run"
+    pages = []
+    monkeypatch.setattr(sweep, "refresh_page", lambda run, complete: pages.append(complete))
     assert sweep.main([*TINY, "--out", str(out)]) == 0
+    assert pages == [True]
     curves = read_table(out / "curves.parquet", CURVES)
     assert len(curves) == 2 * 2 * 2 and set(curves["step"]) == {30, 60}
     episodes = read_table(out / "episodes.parquet", EPISODES)
@@ -65,7 +70,7 @@ def test_a_run_directory_holds_what_it_should(tmp_path, capsys):
 
 
 def test_an_interrupt_leaves_a_readable_directory(tmp_path, monkeypatch):
-    real = sweep._Recorder.update
+    real = recorder.Recorder.update
     calls = []
 
     def interrupted(self, group):
@@ -74,11 +79,11 @@ def test_an_interrupt_leaves_a_readable_directory(tmp_path, monkeypatch):
         if group.finished:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(sweep._Recorder, "update", interrupted)
+    monkeypatch.setattr(recorder.Recorder, "update", interrupted)
     out = tmp_path / "run"
     assert sweep.main([*TINY, "--out", str(out)]) == 130
     assert len(read_table(out / "curves.parquet", CURVES)) == 2
-    monkeypatch.setattr(sweep._Recorder, "update", real)
+    monkeypatch.setattr(recorder.Recorder, "update", real)
     assert sweep.main([*TINY, "--out", str(out)]) == 0
     assert len(read_table(out / "curves.parquet", CURVES)) == 8
 
@@ -243,4 +248,4 @@ def test_a_module_that_registers_worlds_can_be_imported(tmp_path, monkeypatch, c
 
 def test_a_rover_with_faults_has_the_constant_command_too():
     cell = Cell("rover", "ar1-slip+gain-drift", Config(algorithm="td3"))
-    assert [row.name for row in sweep._references(cell)] == ["random", "constant"]
+    assert [row.name for row in references.references_on(cell)] == ["random", "constant"]

@@ -13,6 +13,7 @@ import jax
 import pytest
 
 from rtd3jax import sweep
+from rtd3jax.study import recorder, references
 from rtd3jax.study.rundir import LOG, RunDirectory, read_log
 
 STUDY = [
@@ -26,7 +27,8 @@ TABLES = "curves.parquet", "episodes.parquet", "summary.md"
 
 @pytest.fixture(autouse=True)
 def few_reference_episodes(monkeypatch):
-    monkeypatch.setattr(sweep, "REFERENCE_EPISODES", 2)
+    monkeypatch.setattr(references, "EPISODES", 2)
+    monkeypatch.setattr(sweep, "refresh_page", lambda *_, **__: None)
 
 
 def run(out, *more):
@@ -41,7 +43,8 @@ def contents(out):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sweep, "REFERENCE_EPISODES", 2)
+        patch.setattr(references, "EPISODES", 2)
+        patch.setattr(sweep, "refresh_page", lambda *_, **__: None)
         out = tmp_path_factory.mktemp("whole") / "run"
         assert run(out) == 0
     return out
@@ -70,9 +73,10 @@ def one_step_chunks(monkeypatch):
 DYING = """
 import os, signal, sys
 from rtd3jax import files, sweep
+from rtd3jax.study import references
 from rtd3jax.training import lanes
 
-sweep.REFERENCE_EPISODES = 2
+references.EPISODES = 2
 lanes._FIRST_CHUNK, lanes.CHUNK_SECONDS = 40, 0.0
 part, times = sys.argv[1], int(sys.argv[2])
 real = os.replace
@@ -114,7 +118,7 @@ def test_killed_while_it_writes(part, times, whole, tmp_path):
 
 def test_sigterm_leaves_checkpoints_and_the_rest_is_the_same(whole, tmp_path, monkeypatch, capsys):
     out = tmp_path / "run"
-    real = sweep._Recorder.update
+    real = recorder.Recorder.update
 
     def update(self, group):
         real(self, group)
@@ -122,7 +126,7 @@ def test_sigterm_leaves_checkpoints_and_the_rest_is_the_same(whole, tmp_path, mo
             os.kill(os.getpid(), signal.SIGTERM)
 
     with one_step_chunks(monkeypatch) as patch:
-        patch.setattr(sweep._Recorder, "update", update)
+        patch.setattr(recorder.Recorder, "update", update)
         assert run(out) == 143
     assert "the same command goes on" in capsys.readouterr().out
     assert list(out.rglob("step-*.safetensors"))
@@ -141,7 +145,7 @@ def test_one_worker_finishes_what_two_began(whole, tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     with one_step_chunks(monkeypatch) as patch:
-        patch.setattr(sweep._Recorder, "update", interrupt)
+        patch.setattr(recorder.Recorder, "update", interrupt)
         assert run(out) == 130
     from rtd3jax.training import lanes
 
@@ -154,7 +158,7 @@ def test_one_worker_finishes_what_two_began(whole, tmp_path, monkeypatch):
 def test_the_log_has_each_evaluation_once_however_often_it_was_cut(whole, tmp_path, monkeypatch):
     out = tmp_path / "run"
     calls = []
-    real = sweep._Recorder.update
+    real = recorder.Recorder.update
 
     def update(self, group):
         real(self, group)
@@ -163,7 +167,7 @@ def test_the_log_has_each_evaluation_once_however_often_it_was_cut(whole, tmp_pa
             raise KeyboardInterrupt
 
     with one_step_chunks(monkeypatch) as patch:
-        patch.setattr(sweep._Recorder, "update", update)
+        patch.setattr(recorder.Recorder, "update", update)
         assert run(out) == 130
         with (out / LOG).open("a") as log:
             log.write('{"env": "rover", "disturb')  # a line that SIGKILL cut short
@@ -177,8 +181,8 @@ def test_the_log_has_each_evaluation_once_however_often_it_was_cut(whole, tmp_pa
 
 def test_two_processes_with_a_shard_each_merge_to_the_same_tables(whole, tmp_path):
     out = tmp_path / "run"
-    script = "import sys; from rtd3jax import sweep; sweep.REFERENCE_EPISODES = 2; "
-    script += "sys.exit(sweep.main(sys.argv[1:]))"
+    script = "import sys; from rtd3jax import sweep; from rtd3jax.study import references; "
+    script += "references.EPISODES = 2; sys.exit(sweep.main(sys.argv[1:]))"
     processes = [
         subprocess.Popen(
             [sys.executable, "-c", script, *STUDY, "--out", str(out), "--shard", f"{i}/2"],

@@ -21,7 +21,7 @@ STUDY = [
     *("--algorithms", "td3", "h-td3", "--seeds", "2", "--total-steps", "6000"),
     *("--hidden-size", "16", "--batch-size", "16", "--learning-starts", "100"),
     *("--eval-every", "500", "--eval-episodes", "2", "--final-episodes", "3"),
-    *("--checkpoint-every", "100steps", "--quiet"),
+    *("--checkpoint-every", "100steps", "--quiet", "--no-report"),
 ]
 
 

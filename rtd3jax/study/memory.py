@@ -1,5 +1,6 @@
 """What lanes need in memory, before anything is allocated, and how many fit at once."""
 
+import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -8,7 +9,7 @@ import jax
 from rtd3jax.agents.networks import count_parameters
 from rtd3jax.config import Config
 from rtd3jax.errors import UserError
-from rtd3jax.training.lanes import Job
+from rtd3jax.training.lanes import Job, workers
 
 _ARRAYS = {
     "td3": 5.0,
@@ -93,3 +94,9 @@ def lanes_at_once(jobs: Sequence[Job], strategy: str, workers: int, memory: int)
             "batch_size or history_length"
         )
     return max(1, fit)
+
+
+def memory() -> int:
+    """Bytes of the device's own memory, or of the machine's."""
+    limit = (workers()[0].memory_stats() or {}).get("bytes_limit")
+    return limit or os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")

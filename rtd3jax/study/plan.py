@@ -13,8 +13,8 @@ from rtd3jax.agents.variants import VARIANTS
 from rtd3jax.config import Config
 from rtd3jax.envs.registry import make, parse_disturbance
 from rtd3jax.errors import UserError
-from rtd3jax.study.memory import job_bytes
-from rtd3jax.training.lanes import Job
+from rtd3jax.study.memory import job_bytes, lanes_at_once
+from rtd3jax.training.lanes import Job, workers
 from rtd3jax.training.run import make_jobs
 
 
@@ -62,6 +62,13 @@ class Cell:
         """The cell that `to_dict` wrote."""
         config = {name: value for name, value in fields.items() if name not in _OWN_FIELDS}
         return cls(fields["env"], fields["disturbance"], Config(**config))
+
+
+def label(job: Job) -> str:
+    """A cell in a few words, for people."""
+    cell, _ = job.owner
+    length = f" l={cell.config.history_length}" if cell.config.history_length else ""
+    return f"{cell.config.algorithm}{length} {cell.disturbance}"
 
 
 _OWN_FIELDS = ("env", "disturbance")
@@ -196,3 +203,36 @@ def _matmul_rate(threads: int) -> float:
     for _ in range(4):
         a @ a
     return 4 * 2.0 * size**3 / (time.perf_counter() - began) / threads
+
+
+def plan_text(
+    cells: Sequence[Cell], seeds: Sequence[int], jobs: Sequence[Job], strategy: str, memory: int
+) -> str:
+    """What a sweep will do and what it will cost, for people; ``memory`` in bytes."""
+    count = len(workers())
+    cost = estimate(jobs, count)
+    fit = lanes_at_once(jobs, strategy, count, memory)
+    waits = f"; {len(jobs) - fit:,} wait for their turn" if fit < len(jobs) else ""
+    lines = [f"{len(cells)} cells × {len(seeds)} seeds = {len(jobs)} lanes"]
+    for cell in cells:
+        config = cell.config
+        lines.append(
+            f"  {cell.env:10} {cell.disturbance:24} {config.algorithm:20} "
+            f"l={config.history_length:<3} {config.total_steps:,} steps"
+        )
+    lines += [
+        f"programs to compile: {cost.programs}",
+        f"memory of the largest lane: {cost.state_bytes / 2**20:,.1f} MiB kept (parameters, "
+        f"optimisers, replay, carries), {cost.working_bytes / 2**20:,.1f} MiB more while it "
+        "advances (activations, gradients)",
+        f"lanes that fit in {memory / 2**30:,.1f} GiB"
+        f"{' of a device' if strategy == 'vmap' else ''}: {min(fit, len(jobs)):,}{waits}",
+        f"time: about {_duration(cost.seconds)} on {count} "
+        f"{'cores' if workers()[0].platform == 'cpu' else 'devices'}, "
+        "by a count of operations, without compiling",
+    ]
+    return "\n".join(lines)
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds / 3600:.1f} h" if seconds > 5400 else f"{seconds / 60:.1f} min"

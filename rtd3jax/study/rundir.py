@@ -126,6 +126,10 @@ class RunDirectory:
         """Where a lane that is under way keeps its checkpoints."""
         return self._within("checkpoints", cell_name(cell), f"seed-{seed}")
 
+    def playback_path(self, cell: Cell, seed: int) -> Path:
+        """Where the page keeps the episodes that a lane's policy played for it."""
+        return self._within("playback", cell_name(cell), f"seed-{seed}.json")
+
     def _within(self, *parts: str) -> Path:
         """A path inside the directory, also where links lead elsewhere."""
         path = self.path.joinpath(*parts)

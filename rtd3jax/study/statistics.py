@@ -10,6 +10,7 @@ bootstrap over seeds.
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -61,8 +62,29 @@ def summarise(values: ArrayLike) -> Summary:
     low = high = std = math.nan
     if n >= 2:
         std = float(finite.std(ddof=1))
-        low, high = _bootstrap_interval(finite)
+        low, high = map(float, _bootstrap_interval(finite))
     return Summary(n, float(finite.mean()), std, float(_iqm(finite)), low, high, failed)
+
+
+def iqm_bands(values: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """`summarise` at every point of a curve at once.
+
+    ``values`` [seeds, K] gives the seeds with a finite value int [K], and their IQM with the bounds
+    of its interval, float64 [K] each: nan where no seed is left, the bounds where fewer than two.
+    """
+    array = np.asarray(values, np.float64)
+    finite = np.isfinite(array)
+    iqm, low, high = (np.full(array.shape[1], np.nan) for _ in range(3))
+    # Points at which the same seeds are left share one set of resamples.
+    patterns, which = np.unique(finite, axis=1, return_inverse=True)
+    for index in range(patterns.shape[1]):
+        points = np.flatnonzero(which.ravel() == index)
+        kept = array[np.ix_(patterns[:, index], points)]
+        if kept.shape[0] >= 1:
+            iqm[points] = _iqm(kept, axis=0)
+        if kept.shape[0] >= 2:
+            low[points], high[points] = _bootstrap_interval(kept)
+    return finite.sum(axis=0), iqm, low, high
 
 
 def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> float:
@@ -91,16 +113,17 @@ def _iqm(values: np.ndarray, axis: int = -1) -> np.ndarray:
     return stats.trim_mean(values, TRIM, axis=axis)
 
 
-def _bootstrap_interval(values: np.ndarray) -> tuple[float, float]:
-    """95 % percentile bootstrap interval of the IQM of ``values`` [n >= 2]."""
+def _bootstrap_interval(values: np.ndarray) -> tuple[Any, Any]:
+    """95 % percentile bootstrap interval of the IQM of ``values`` [n >= 2, ...] over the seeds."""
     # Sorted, because the resamples pick by position: the order of seeds must not matter.
     result = stats.bootstrap(
-        (np.sort(values),),
+        (np.sort(values, axis=0),),
         _iqm,
+        axis=0,
         n_resamples=RESAMPLES,
         confidence_level=CONFIDENCE,
         method="percentile",
         vectorized=True,
         rng=np.random.default_rng(BOOTSTRAP_SEED),
     )
-    return float(result.confidence_interval.low), float(result.confidence_interval.high)
+    return result.confidence_interval.low, result.confidence_interval.high

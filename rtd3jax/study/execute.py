@@ -1,0 +1,73 @@
+"""Lanes of a run directory, trained in this process."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+from rtd3jax.study.loggers import Logger
+from rtd3jax.study.plan import label
+from rtd3jax.study.recorder import Recorder
+from rtd3jax.study.rundir import Reference, RunDirectory
+from rtd3jax.training.checkpoint import Checkpoints
+from rtd3jax.training.lanes import Group, Job, advance_groups, make_groups, workers
+from rtd3jax.training.progress import Progress
+
+
+@dataclasses.dataclass(frozen=True)
+class Work:
+    """How lanes are trained.
+
+    Attributes:
+        strategy: ``map`` or ``vmap``; see `rtd3jax.training.lanes`.
+        at_once: lanes that fit in memory.
+        interval: of checkpoints, (seconds, steps); see `rtd3jax.study.options.parse_interval`.
+        quiet: no progress bar, no remarks.
+    """
+
+    strategy: str
+    at_once: int
+    interval: tuple[float | None, int | None] = (None, None)
+    quiet: bool = False
+
+
+def train_here(
+    directory: RunDirectory,
+    jobs: Sequence[Job],
+    work: Work,
+    complaints: list[str],
+    references: Sequence[Reference] | None = None,
+    logger: Logger | None = None,
+) -> None:
+    """Train the lanes that are not done; ``complaints`` gains a line for each that fails.
+
+    With ``references``, tables and page are refreshed now and then.
+    """
+    waiting = [job for job in jobs if not directory.is_done(*job.owner)]
+    if len(waiting) < len(jobs):
+        print(f"{len(jobs) - len(waiting)} of {len(jobs)} lanes are there already")
+    for job in waiting:
+        directory.error_path(*job.owner).unlink(missing_ok=True)
+    if work.at_once < len(waiting) and not work.quiet:
+        print(f"memory for {work.at_once:,} lanes at once: the others wait for their turn")
+    groups = make_groups(waiting, work.strategy, len(workers()), work.at_once)
+    checkpoints = checkpoints_of(directory, work.interval)
+    recorder = Recorder(directory, checkpoints, references, logger, complaints)
+    with Progress(groups, label, enabled=not work.quiet) as bar:
+
+        def on_chunk(group: Group) -> None:
+            bar.update(group)
+            recorder.update(group)
+
+        advance_groups(groups, on_chunk, checkpoints)
+
+
+def checkpoints_of(
+    directory: RunDirectory, interval: tuple[float | None, int | None]
+) -> Checkpoints:
+    """Where the lanes of a run keep their checkpoints, and as what."""
+
+    def identity(job: Job) -> dict[str, Any]:
+        cell, seed = job.owner
+        return {**cell.to_dict(), "seed": seed, "window": job.program.tokens}
+
+    return Checkpoints(lambda job: directory.checkpoint_directory(*job.owner), identity, *interval)

@@ -1,0 +1,176 @@
+"""Learning curves in the trackers that people already use, fed between chunks.
+
+A lane is a run of the tracker, named as in the run directory; its metrics are ``evaluation/return``
+against environment steps. A lane that goes on from a checkpoint goes on in its run. Where a tracker
+keeps its files or sends them is for its own environment variables to say (``WANDB_MODE``,
+``MLFLOW_TRACKING_URI``); by default all of it stays in the run directory.
+"""
+
+import contextlib
+import hashlib
+import importlib
+import importlib.util
+import os
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from rtd3jax.errors import UserError
+from rtd3jax.study.plan import Cell
+from rtd3jax.study.rundir import RunDirectory, cell_name
+
+METRIC = "evaluation/return"
+
+
+class Logger(Protocol):
+    """What takes the rows of the log as they are written."""
+
+    def log(self, cell: Cell, seed: int, row: dict[str, Any]) -> None:
+        """Take ``row``, which has ``step`` and ``return`` (None where it is not finite)."""
+
+    def close(self) -> None:
+        """Write what is not written yet."""
+
+
+class TensorBoard:
+    """Event files in ``RUN/tensorboard/<cell>/seed-<n>``."""
+
+    def __init__(self, directory: RunDirectory) -> None:
+        self._make = importlib.import_module("tensorboardX").SummaryWriter
+        self._path = directory.path / "tensorboard"
+        self._writers: dict[tuple[str, int], Any] = {}
+
+    def log(self, cell: Cell, seed: int, row: dict[str, Any]) -> None:
+        """A point of the lane's curve."""
+        lane = cell_name(cell), seed
+        if lane not in self._writers:
+            path = self._path / lane[0] / f"seed-{seed}"
+            self._writers[lane] = self._make(str(path))
+        if row["return"] is not None:
+            self._writers[lane].add_scalar(METRIC, row["return"], row["step"])
+
+    def close(self) -> None:
+        """End the files."""
+        for writer in self._writers.values():
+            writer.close()
+
+
+class WandB:
+    """A run of Weights & Biases for each lane; the project is named after the run directory."""
+
+    def __init__(self, directory: RunDirectory) -> None:
+        self._wandb = importlib.import_module("wandb")
+        self._path = directory.path
+        self._runs: dict[tuple[str, int], Any] = {}
+
+    def log(self, cell: Cell, seed: int, row: dict[str, Any]) -> None:
+        """A point of the lane's curve."""
+        lane = cell_name(cell), seed
+        if lane not in self._runs:
+            self._runs[lane] = self._wandb.init(
+                project=os.environ.get("WANDB_PROJECT", self._path.resolve().name),
+                id=_lane_id(self._path, *lane),
+                resume="allow",
+                reinit="create_new",
+                dir=str(self._path),
+                group=lane[0],
+                name=f"{lane[0]} seed {seed}",
+                config={**cell.to_dict(), "seed": seed},
+            )
+            self._runs[lane].define_metric(METRIC, step_metric="step")
+        if row["return"] is not None:
+            self._runs[lane].log({METRIC: row["return"], "step": row["step"]})
+
+    def close(self) -> None:
+        """End the runs."""
+        for run in self._runs.values():
+            run.finish()
+
+
+class MLflow:
+    """A run of MLflow for each lane, in the experiment named after the run directory."""
+
+    def __init__(self, directory: RunDirectory) -> None:
+        mlflow = importlib.import_module("mlflow")
+        self._path = directory.path
+        store = f"sqlite:///{(directory.path / 'mlflow.db').resolve()}"
+        self._client = mlflow.MlflowClient(os.environ.get("MLFLOW_TRACKING_URI", store))
+        name = directory.path.resolve().name
+        found = self._client.get_experiment_by_name(name)
+        self._experiment = found.experiment_id if found else self._client.create_experiment(name)
+        self._runs: dict[tuple[str, int], str] = {}
+
+    def log(self, cell: Cell, seed: int, row: dict[str, Any]) -> None:
+        """A point of the lane's curve."""
+        lane = cell_name(cell), seed
+        if lane not in self._runs:
+            self._runs[lane] = self._run_of(cell, seed, _lane_id(self._path, *lane))
+        if row["return"] is not None:
+            self._client.log_metric(self._runs[lane], METRIC, row["return"], step=row["step"])
+
+    def _run_of(self, cell: Cell, seed: int, lane: str) -> str:
+        query = f"tags.lane = '{lane}'"
+        for run in self._client.search_runs([self._experiment], query, max_results=1):
+            return run.info.run_id
+        name = f"{cell_name(cell)} seed {seed}"
+        run = self._client.create_run(self._experiment, tags={"lane": lane}, run_name=name)
+        for key, value in {**cell.to_dict(), "seed": seed}.items():
+            self._client.log_param(run.info.run_id, key, value)
+        return run.info.run_id
+
+    def close(self) -> None:
+        """End the runs."""
+        for run in self._runs.values():
+            self._client.set_terminated(run)
+
+
+LOGGERS: dict[str, tuple[str, Callable[[RunDirectory], Logger]]] = {
+    "tensorboard": ("tensorboardX", TensorBoard),
+    "wandb": ("wandb", WandB),
+    "mlflow": ("mlflow", MLflow),
+}
+"""What ``--log`` knows: the package that it needs, and the logger."""
+
+
+class _Several:
+    def __init__(self, loggers: Sequence[Logger]) -> None:
+        self._loggers = loggers
+
+    def log(self, cell: Cell, seed: int, row: dict[str, Any]) -> None:
+        for logger in self._loggers:
+            logger.log(cell, seed, row)
+
+    def close(self) -> None:
+        for logger in self._loggers:
+            logger.close()
+
+
+def check_loggers(names: Sequence[str]) -> None:
+    """Refuse what is not installed.
+
+    Raises:
+        UserError: naming the extra that brings it.
+    """
+    for name in names:
+        package, _ = LOGGERS[name]
+        if importlib.util.find_spec(package) is None:
+            raise UserError(f"--log {name} needs {package}: pip install 'rtd3jax[{name}]'")
+
+
+@contextlib.contextmanager
+def open_loggers(names: Sequence[str], directory: RunDirectory) -> Iterator[Logger | None]:
+    """The loggers of these names as one, closed at the end; None without names."""
+    if not names:
+        yield None
+        return
+    logger = _Several([LOGGERS[name][1](directory) for name in dict.fromkeys(names)])
+    try:
+        yield logger
+    finally:
+        logger.close()
+
+
+def _lane_id(path: Path, cell: str, seed: int) -> str:
+    """The same for a lane each time that its run directory goes on, and no one else's."""
+    text = f"{path.resolve()}\n{cell}\n{seed}"
+    return hashlib.sha256(text.encode()).hexdigest()[:24]

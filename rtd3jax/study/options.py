@@ -1,0 +1,162 @@
+"""The sweep's options: what may be said on the command line, and what it means."""
+
+import argparse
+import dataclasses
+import math
+import re
+from pathlib import Path
+from typing import Any, NoReturn
+
+import jax
+
+from rtd3jax.config import ALGORITHMS, Config
+from rtd3jax.envs.registry import DISTURBANCES, ENVIRONMENTS
+from rtd3jax.errors import UserError
+from rtd3jax.study.loggers import LOGGERS
+from rtd3jax.study.plan import PRESETS, Grid
+
+_GRID_FIELDS = ("algorithm", "history_length")
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise UserError(f"{message}; --help lists what there is")
+
+
+def parser(description: str | None) -> argparse.ArgumentParser:
+    """The command line of ``rtd3jax.sweep``; bad input raises `UserError`."""
+    worlds = "\n".join(f"  {env}: {', '.join(DISTURBANCES[env])}" for env in ENVIRONMENTS)
+    found = _Parser(
+        prog="python -m rtd3jax.sweep",
+        description=description,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=f"disturbances:\n{worlds}\n  parameters may follow: noise:sigma=1.0\n"
+        "  + joins several: ar1-slip+dropout:p=0.2\n\n"
+        "example:\n  python -m rtd3jax.sweep --env pendulum --algorithms td3 lstm-td3-1ha1hc \\\n"
+        "      --disturbances random-sine noise --history-lengths 1 10 --seeds 5 --out runs/mine",
+    )
+    study = found.add_argument_group("the study")
+    study.add_argument("--preset", choices=sorted(PRESETS), help="a prepared study")
+    study.add_argument(
+        "--env", help=f"{', '.join(ENVIRONMENTS)}, a registered id, or any id that gymnax makes"
+    )
+    study.add_argument(
+        "--import",
+        dest="imports",
+        action="append",
+        default=[],
+        metavar="MODULE",
+        help="a Python module that registers worlds (rtd3jax.register)",
+    )
+    study.add_argument("--disturbances", nargs="+", metavar="ID", help="what is hidden [none]")
+    study.add_argument("--algorithms", nargs="+", metavar="ID", help=f"{', '.join(ALGORITHMS)}")
+    study.add_argument(
+        "--history-lengths", nargs="+", type=int, metavar="L", help="past steps in a window [10]"
+    )
+    study.add_argument("--seeds", type=int, default=5, help="lanes of a cell, seeds 0, 1, ... [5]")
+    study.add_argument(
+        "--final-episodes", type=int, default=20, help="episodes of the final evaluation [20]"
+    )
+    work = found.add_argument_group("the work")
+    work.add_argument("--out", metavar="DIR", help="run directory [runs/PRESET or runs/ENV]")
+    work.add_argument("--status", action="store_true", help="what is done in --out, lane by lane")
+    work.add_argument(
+        "--fresh", action="store_true", help="start over; what was there is kept as DIR.old-N"
+    )
+    work.add_argument("--shard", metavar="I/N", help="this process takes the I-th of N shares")
+    work.add_argument(
+        "--checkpoint-every",
+        default="auto",
+        metavar="T",
+        help="300s, 5m, 1h or 2000steps [five minutes, or longer where it would cost above 2%%]",
+    )
+    work.add_argument("--dry-run", action="store_true", help="print the plan and its cost")
+    work.add_argument(
+        "--log",
+        nargs="+",
+        default=[],
+        choices=sorted(LOGGERS),
+        metavar="TRACKER",
+        help=f"learning curves also to {', '.join(sorted(LOGGERS))}",
+    )
+    work.add_argument(
+        "--no-report", dest="report", action="store_false", help="do not write report.html"
+    )
+    work.add_argument("--quiet", action="store_true", help="no progress bar")
+    work.add_argument("--device", choices=("cpu", "gpu", "tpu"), help="where to run [the best]")
+    work.add_argument(
+        "--strategy", choices=("map", "vmap"), help="lanes one by one or side by side"
+    )
+    config = found.add_argument_group("the configuration of every cell")
+    for field in dataclasses.fields(Config):
+        if field.name not in _GRID_FIELDS:
+            default = "" if field.default is None else f" [{field.default}]"
+            kind = {"str": str, "float": float}.get(str(getattr(field.type, "__name__", "")), int)
+            config.add_argument(
+                "--" + field.name.replace("_", "-"),
+                type=kind,
+                metavar="NAME" if kind is str else "N",
+                help=field.metadata["help"].replace("%", "%%") + default,
+            )
+    return found
+
+
+def grids(options: argparse.Namespace) -> list[Grid]:
+    """The preset's grids with the lists that were given in place of theirs."""
+    if options.preset is None and options.env is None:
+        raise UserError("say what to run: --preset quick, or --env with --algorithms")
+    if options.preset is None:
+        found = [Grid(options.env, ("none",), ALGORITHMS)]
+    else:
+        found = list(PRESETS[options.preset])
+    given = {
+        "env": options.env,
+        "disturbances": options.disturbances and tuple(options.disturbances),
+        "algorithms": options.algorithms and tuple(options.algorithms),
+        "history_lengths": options.history_lengths and tuple(options.history_lengths),
+    }
+    changes = {name: value for name, value in given.items() if value is not None}
+    return [dataclasses.replace(grid, **changes) for grid in found]
+
+
+def overrides(options: argparse.Namespace) -> dict[str, Any]:
+    """Fields of the configuration that were given."""
+    names = (f.name for f in dataclasses.fields(Config) if f.name not in _GRID_FIELDS)
+    return {n: getattr(options, n) for n in names if getattr(options, n) is not None}
+
+
+def out(options: argparse.Namespace) -> Path:
+    """The run directory."""
+    if not (options.out or options.preset or options.env):
+        raise UserError("say where: --out DIR")
+    return Path(options.out or Path("runs") / (options.preset or options.env))
+
+
+def count(name: str, value: int, most: int = 100_000) -> int:
+    """``value``, if it is from 1 to ``most``."""
+    if not 1 <= value <= most:
+        raise UserError(f"{name} must be from 1 to {most:,}, not {value}")
+    return value
+
+
+def device(platform: str) -> Any:
+    """The first device of a platform."""
+    try:
+        return jax.local_devices(backend=platform)[0]
+    except RuntimeError as error:
+        raise UserError(
+            f"--device {platform}: there is none here, or JAX was installed without it "
+            "(pip install 'rtd3jax[cuda13]' for NVIDIA GPUs)"
+        ) from error
+
+
+def parse_interval(text: str) -> tuple[float | None, int | None]:
+    """``"300s"``, ``"5m"`` or ``"2000steps"`` as (seconds, None) or (infinity, steps)."""
+    if text == "auto":
+        return None, None
+    match = re.fullmatch(r"(\d{1,9})\s*(s|m|h|steps)?", text.strip())
+    if match is None or int(match[1]) < 1:
+        raise UserError(f"--checkpoint-every {text!r} is not like 300s, 5m, 1h or 2000steps")
+    if match[2] == "steps":
+        return math.inf, int(match[1])
+    return float(match[1]) * {"m": 60, "h": 3600}.get(match[2], 1), None

@@ -1,0 +1,119 @@
+"""Lanes written down as they end, and the log as they go."""
+
+import json
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from rtd3jax.study.loggers import Logger
+from rtd3jax.study.plan import label
+from rtd3jax.study.references import both_returns
+from rtd3jax.study.report.page import refresh_page
+from rtd3jax.study.rundir import LOG, Reference, RunDirectory
+from rtd3jax.training.checkpoint import Checkpoints
+from rtd3jax.training.lanes import Group, Job
+from rtd3jax.training.run import curves_of, evaluation_steps, failure_of
+
+EARLY_ANSWERS_SECONDS = 60.0
+"""At most so often are tables, pictures and the page made while the sweep runs."""
+
+
+class Recorder:
+    """Writes lanes down as they end, and the log as they go."""
+
+    def __init__(
+        self,
+        directory: RunDirectory,
+        checkpoints: Checkpoints,
+        references: Sequence[Reference] | None,
+        logger: Logger | None,
+        complaints: list[str],
+    ):
+        """Without ``references``, tables and page are left to whoever started this process."""
+        self._directory = directory
+        self._checkpoints = checkpoints
+        self._references = references
+        self._logger = logger
+        self._derived = time.perf_counter()
+        self._logged: dict[int, int] = {}
+        self._there = directory.repair_log()
+        self._began = time.perf_counter()
+        self._complaints = complaints
+
+    def update(self, group: Group) -> None:
+        """Take note of a chunk that ``group`` has done, of its end, or of its error."""
+        if group.error is not None:
+            reason = str(group.error).splitlines()[0] if str(group.error) else repr(group.error)
+            for job in group.jobs:
+                cell, seed = job.owner
+                self._directory.write_error(cell, seed, reason)
+                self._complaints.append(f"{label(job)} seed {seed} failed: {reason}")
+            return
+        self._log(group)
+        # An event may be read late, after the one that already kept the group.
+        if group.finished and group.state is not None:
+            for job, state in group.lanes():
+                self._keep(job, state)
+                self._checkpoints.discard(job)
+            group.state = None  # its replay is no longer needed
+            self._answer_early()
+
+    def _answer_early(self) -> None:
+        late = time.perf_counter() - self._derived > EARLY_ANSWERS_SECONDS
+        if self._references is not None and late:
+            self._directory.derive(self._references)
+            refresh_page(self._directory, complete=False)
+            self._derived = time.perf_counter()
+
+    def _log(self, group: Group) -> None:
+        assert group.returns is not None
+        with (self._directory.path / LOG).open("a") as log:
+            for index, job in enumerate(group.jobs):
+                cell, seed = job.owner
+                curve, steps = group.returns[index], evaluation_steps(cell.config)
+                reached = int(np.sum(steps <= group.step))
+                for k in range(self._logged.get(id(job), 0), reached):
+                    lane = {**cell.key, "seed": seed, "step": int(steps[k])}
+                    if tuple(lane.values()) in self._there:
+                        continue  # the lane went on from a checkpoint before this evaluation
+                    row = {
+                        **lane,
+                        "return": _json_number(curve[k]),
+                        "seconds": round(time.perf_counter() - self._began, 3),
+                    }
+                    log.write(json.dumps(row) + "\n")
+                    if self._logger is not None:
+                        self._logger.log(cell, seed, row)
+                self._logged[id(job)] = reached
+
+    def _keep(self, job: Job, state: Any) -> None:
+        cell, seed = job.owner
+        failure = failure_of(seed, state)
+        returns, true_returns = curves_of(cell.config, state, failure)
+        final = np.full((2, self._directory.episodes), np.nan, np.float32)
+        if failure is None:
+            policy = job.program.policy(job.lane, state.learner.actor)
+            final = np.stack(both_returns(policy, cell.make_env(), self._directory.episodes, seed))
+        else:
+            self._complaints.append(
+                f"{label(job)} seed {seed} was lost at step {failure.step}: {failure.reason}"
+            )
+        self._directory.write_lane(
+            cell,
+            seed,
+            state.learner.actor,
+            {
+                "steps": evaluation_steps(cell.config),
+                "returns": returns,
+                "true_returns": true_returns,
+                "final_returns": final[0],
+                "final_true_returns": final[1],
+            },
+            None if failure is None else {"step": failure.step, "reason": failure.reason},
+        )
+
+
+def _json_number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

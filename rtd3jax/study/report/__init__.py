@@ -1,0 +1,1 @@
+"""The page of a run directory: one HTML file that needs no network."""

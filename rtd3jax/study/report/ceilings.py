@@ -1,0 +1,57 @@
+"""Ceilings of a study's worlds, kept in its run directory once they are computed."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from rtd3jax.ceilings import Ceiling, ceiling
+from rtd3jax.errors import UserError
+from rtd3jax.files import write_bytes_atomically
+from rtd3jax.study.report.data import number
+from rtd3jax.study.rundir import RunDirectory
+from rtd3jax.versions import versions_of
+
+FILE = "ceilings.json"
+
+
+def ceilings_of(directory: RunDirectory, *, compute: bool) -> dict[tuple[str, str], dict[str, Any]]:
+    """Of each (env, disturbance): mean, standard error and kind, or the reason for having none.
+
+    Without ``compute``, only those that were computed before, by this version.
+    """
+    path = directory.path / FILE
+    version = versions_of(["rtd3jax"])["rtd3jax"]
+    kept = _read(path, version)
+    found, before = {}, len(kept)
+    for world, cell in {(cell.env, cell.disturbance): cell for cell in directory.cells}.items():
+        name = " | ".join(world)
+        if name not in kept and compute:
+            try:
+                kept[name] = _entry(ceiling(cell.make_env()))
+            except UserError as error:
+                found[world] = {"missing": str(error)}
+        if name in kept:
+            found[world] = kept[name]
+    if len(kept) > before:
+        text = json.dumps({"rtd3jax": version, "ceilings": kept}, indent=1)
+        write_bytes_atomically(path, text.encode())
+    return found
+
+
+def _entry(best: Ceiling) -> dict[str, Any]:
+    mean, error = number(best.mean), number(best.standard_error)
+    return {"mean": mean, "error": error, "kind": best.kind}
+
+
+def _read(path: Path, version: str) -> dict[str, dict[str, Any]]:
+    try:
+        content = json.loads(path.read_text())
+        if content["rtd3jax"] == version:
+            return {
+                name: entry
+                for name, entry in content["ceilings"].items()
+                if {"mean", "error", "kind"} <= set(entry)
+            }
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        pass  # another version's, or none
+    return {}

@@ -1,0 +1,253 @@
+"""What the page shows of a run directory, as values that JSON has.
+
+Numbers are rounded to five significant digits, and what is not finite is None. Whatever cannot be
+had is left out, and a note says why: a page of an unfinished run is a page all the same.
+"""
+
+import dataclasses
+import json
+import math
+import re
+from collections import Counter
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from rtd3jax.config import Config
+from rtd3jax.errors import UserError
+from rtd3jax.study.figures import COLOURS, OTHER_COLOUR
+from rtd3jax.study.plan import Cell
+from rtd3jax.study.results import CELL, CURVES, EPISODES, REFERENCES, read_table
+from rtd3jax.study.rundir import LOG, RunDirectory, read_log
+from rtd3jax.study.statistics import Summary, iqm_bands, seed_means, summarise
+
+MOST_POINTS = 200
+"""Points of a learning curve that are drawn; of a longer one, as many, evenly spaced."""
+
+ON_DARK = {"td3": "#F2F2F2", "lstm-td3": "#3D9BE0"}
+"""Colours of `figures.COLOURS` that a dark page would swallow, made lighter."""
+
+MEASURES = {"return": "as rewarded", "true_return": "of the true state"}
+
+
+def study_data(
+    directory: RunDirectory, curves: pd.DataFrame, episodes: pd.DataFrame, notes: list[str]
+) -> dict[str, Any]:
+    """Everything but ceilings, transfer and playback; ``notes`` gains what is missing."""
+    curves = _with_log(curves, directory)
+    worlds = list(dict.fromkeys((cell.env, cell.disturbance) for cell in directory.cells))
+    algorithms = _in_order(cell.config.algorithm for cell in directory.cells)
+    measures = [m for m in MEASURES if m == "return" or _differs(curves, episodes)]
+    ledger = _ledger(directory, notes)
+    begun = Counter(
+        tuple(row[name] for name in CELL) for row in ledger if row["status"] != "planned"
+    )
+    lanes = seed_means(episodes)
+    return {
+        "title": directory.path.resolve().name,
+        "measures": [[name, MEASURES[name]] for name in measures],
+        "worlds": [
+            {
+                "env": env,
+                "disturbance": disturbance,
+                "references": _references(episodes, env, disturbance, measures),
+                "ceiling": None,
+            }
+            for env, disturbance in worlds
+        ],
+        "agents": [
+            {
+                "name": name,
+                "colour": COLOURS.get(name, OTHER_COLOUR),
+                "dark": ON_DARK.get(name, COLOURS.get(name, OTHER_COLOUR)),
+            }
+            for name in algorithms
+        ],
+        "cells": [
+            {
+                "world": worlds.index((cell.env, cell.disturbance)),
+                "agent": algorithms.index(cell.config.algorithm),
+                "length": cell.config.history_length,
+                "seeds": len(directory.seeds),
+                "begun": begun[tuple(cell.key[name] for name in CELL)],
+                "curves": {m: _curve(_of(curves, cell), m) for m in measures},
+                "final": {m: _final(_of(lanes, cell), m) for m in measures},
+            }
+            for cell in directory.cells
+        ],
+        "study": _study(directory.cells, directory.seeds, directory.episodes),
+        "status": dict(Counter(row["status"] for row in ledger)),
+        "troubles": [row for row in ledger if row["status"] not in ("done", "planned")],
+        "timing": _timing(directory),
+        "made_with": _made_with(directory),
+    }
+
+
+def number(value: Any) -> float | None:
+    """Five significant digits, or None."""
+    value = float(value)
+    return float(f"{value:.5g}") if math.isfinite(value) else None
+
+
+def tables_of(directory: RunDirectory, notes: list[str]) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """The learning curves and the final episodes; empty tables where there are none yet."""
+    tables = []
+    for name, schema in (("curves", CURVES), ("episodes", EPISODES)):
+        try:
+            tables.append(read_table(directory.path / f"{name}.parquet", schema))
+        except UserError as error:
+            reason = f"there is no {name}.parquet yet"
+            notes.append(reason if "no results table" in str(error) else str(error))
+            tables.append(schema.empty_table().to_pandas())
+    return tables[0], tables[1]
+
+
+def _with_log(curves: pd.DataFrame, directory: RunDirectory) -> pd.DataFrame:
+    """The curves there are, and those of lanes under way, which only the log has."""
+    key = [*CELL, "seed"]
+    kept = set(curves[key].itertuples(index=False, name=None))
+    study = {(*cell.key.values(), seed) for cell in directory.cells for seed in directory.seeds}
+    rows: dict[tuple, dict[str, Any]] = {}
+    for row in read_log(directory.path / LOG):
+        lane = tuple(row[name] for name in key)
+        value = row.get("return")
+        if lane in study and lane not in kept and isinstance(value, float | int):
+            # A lane that was trained again is logged again; the later row holds.
+            point = {name: row[name] for name in (*key, "step")}
+            rows[*lane, row["step"]] = {**point, "return": value, "true_return": math.nan}
+    if not rows:
+        return curves
+    return pd.concat([curves, pd.DataFrame(list(rows.values()))[curves.columns]])
+
+
+def _in_order(names: Iterable[str]) -> list[str]:
+    known = list(COLOURS)
+    return sorted(set(names), key=lambda n: (known.index(n) if n in known else len(known), n))
+
+
+def _differs(curves: pd.DataFrame, episodes: pd.DataFrame) -> bool:
+    """Whether the reward that is given is anywhere not the true state's."""
+    pairs = [table[["return", "true_return"]].dropna() for table in (curves, episodes)]
+    return any(not np.allclose(pair["return"], pair["true_return"]) for pair in pairs)
+
+
+def _of(table: pd.DataFrame, cell: Cell) -> pd.DataFrame:
+    keep = np.ones(len(table), bool)
+    for name, value in cell.key.items():
+        keep &= (table[name] == value).to_numpy()
+    return table[keep]
+
+
+def _references(
+    episodes: pd.DataFrame, env: str, disturbance: str, measures: list[str]
+) -> list[dict[str, Any]]:
+    """Mean return of each policy that needs no training."""
+    here = episodes[(episodes["env"] == env) & (episodes["disturbance"] == disturbance)]
+    found = []
+    for name in REFERENCES:
+        of_policy = here[here["algorithm"] == name]
+        if len(of_policy):
+            found.append({"name": name, **{m: number(of_policy[m].mean()) for m in measures}})
+    return found
+
+
+def _curve(rows: pd.DataFrame, measure: str) -> dict[str, Any] | None:
+    """IQM over the seeds and the bounds of its interval, at each evaluation."""
+    rows = rows[np.isfinite(rows[measure].astype(np.float64))]
+    if rows.empty:
+        return None
+    table = rows.pivot(index="seed", columns="step", values=measure)
+    if table.shape[1] > MOST_POINTS:
+        points = np.unique(np.linspace(0, table.shape[1] - 1, MOST_POINTS).round().astype(int))
+        table = table.iloc[:, points]
+    count, iqm, low, high = iqm_bands(table.to_numpy(np.float64))
+    return {
+        "steps": [int(step) for step in table.columns],
+        "seeds": [int(seeds) for seeds in count],
+        "iqm": [number(value) for value in iqm],
+        "low": [number(value) for value in low],
+        "high": [number(value) for value in high],
+    }
+
+
+def _final(lanes: pd.DataFrame, measure: str) -> dict[str, Any] | None:
+    """The final evaluation: a mean per seed, and their summary."""
+    if lanes.empty:
+        return None
+    values = lanes[measure].to_numpy(np.float64)
+    return {
+        **summary_data(summarise(values)),
+        "values": [number(value) for value in values if math.isfinite(value)],
+    }
+
+
+def summary_data(summary: Summary) -> dict[str, Any]:
+    """The aggregates of a cell."""
+    return {
+        "n": summary.n,
+        "lost": summary.failed,
+        "mean": number(summary.mean),
+        "std": number(summary.std),
+        "iqm": number(summary.iqm),
+        "low": number(summary.iqm_low),
+        "high": number(summary.iqm_high),
+    }
+
+
+def _study(cells: list[Cell], seeds: list[int], episodes: int) -> dict[str, Any]:
+    """Settings that all cells share, and the values of those in which they differ."""
+    about = {field.name: field.metadata["help"] for field in dataclasses.fields(Config)}
+    dicts = [cell.to_dict() for cell in cells]
+    rows = []
+    for name in dicts[0]:
+        values = list(dict.fromkeys(fields[name] for fields in dicts))
+        rows.append({"name": name, "values": values, "about": about.get(name, "")})
+    return {"cells": len(cells), "seeds": list(seeds), "episodes": episodes, "settings": rows}
+
+
+def _ledger(directory: RunDirectory, notes: list[str]) -> list[dict[str, Any]]:
+    try:
+        return directory.ledger()
+    except UserError as error:
+        notes.append(f"the state of the lanes is not known: {error}")
+        return []
+
+
+def _timing(directory: RunDirectory) -> dict[str, Any] | None:
+    """What the log tells of time: a session's clock starts at zero.
+
+    Shards write one log at the same time, each with its own clock; their sum would be no one's
+    time, so it is left out.
+    """
+    rows = read_log(directory.path / LOG)
+    stamps = [row.get("seconds") for row in rows]
+    if not rows or not all(isinstance(stamp, int | float) for stamp in stamps):
+        return None
+    reached: dict[tuple, int] = {}
+    for row in rows:
+        lane = tuple(row[name] for name in (*CELL, "seed"))
+        reached[lane] = max(reached.get(lane, 0), row["step"])
+    steps = sum(reached.values())
+    shards = [
+        entry for entry in directory.path.iterdir() if re.match(r"\.lock-\d+-of-", entry.name)
+    ]
+    if shards:
+        return {"steps": steps, "shards": len(shards)}
+    ends = [a for a, b in zip(stamps, [*stamps[1:], -1.0], strict=True) if a is not None and b < a]
+    seconds = sum(ends)
+    return {
+        "steps": steps,
+        "sessions": len(ends),
+        "seconds": number(seconds),
+        "steps_per_second": number(steps / seconds) if seconds else None,
+    }
+
+
+def _made_with(directory: RunDirectory) -> dict[str, Any]:
+    try:
+        found = json.loads((directory.path / "config.json").read_text())["made_with"]
+        return found if isinstance(found, dict) else {}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}

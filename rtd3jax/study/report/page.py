@@ -1,0 +1,122 @@
+"""The page as a file: data, drawing code and style in one HTML document."""
+
+import datetime
+import html
+import importlib.resources
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+from rtd3jax.errors import UserError
+from rtd3jax.files import write_bytes_atomically
+from rtd3jax.study.report.ceilings import ceilings_of
+from rtd3jax.study.report.data import study_data, tables_of
+from rtd3jax.study.report.playback import recordings
+from rtd3jax.study.report.transfer import FILE as TRANSFER
+from rtd3jax.study.report.transfer import transfer_data
+from rtd3jax.study.rundir import RunDirectory
+from rtd3jax.study.statistics import seed_means
+from rtd3jax.versions import versions_of
+
+NAME = "report.html"
+_GENERATOR = '<meta name="generator" content="rtd3jax">'
+_SCRIPTS = ("dom", "charts", "filters", "curves", "finals", "table", "transfer", "player", "main")
+
+
+def write_page(
+    directory: RunDirectory,
+    path: Path | None = None,
+    *,
+    complete: bool = True,
+    playback: bool = True,
+) -> Path:
+    """Write the page of a run; its path.
+
+    Args:
+        directory: the run.
+        path: of the page; ``report.html`` in the run directory by default.
+        complete: compute ceilings and play episodes where that was not done before. Without it
+            the page is cheap, and has those that are kept from before.
+        playback: whether the page has episodes at all.
+
+    Raises:
+        UserError: when ``path`` holds something that is not a page of ours, or cannot be written.
+    """
+    path = directory.path / NAME if path is None else path
+    _check_ours(path)
+    page = render(page_data(directory, complete=complete, playback=playback))
+    try:
+        write_bytes_atomically(path, page.encode())
+    except OSError as error:
+        raise UserError(f"{path} cannot be written: {error.strerror}") from error
+    return path
+
+
+def refresh_page(directory: RunDirectory, *, complete: bool) -> None:
+    """Write the page if that can be done; a sweep goes on in any case."""
+    try:
+        write_page(directory, complete=complete)
+    except Exception as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        print(f"{NAME} was not written: {reason}", file=sys.stderr)
+
+
+def page_data(directory: RunDirectory, *, complete: bool, playback: bool) -> dict[str, Any]:
+    """All that the page's code draws."""
+    notes: list[str] = []
+    curves, episodes = tables_of(directory, notes)
+    data = study_data(directory, curves, episodes, notes)
+    ceilings = ceilings_of(directory, compute=complete)
+    for world in data["worlds"]:
+        world["ceiling"] = ceilings.get((world["env"], world["disturbance"]))
+    try:
+        data["transfer"] = transfer_data(directory.path / TRANSFER)
+    except UserError as error:
+        data["transfer"] = None
+        notes.append(str(error))
+    data["playback"] = []
+    if playback:
+        lanes = seed_means(episodes)
+        data["playback"] = recordings(directory, lanes, record=complete, notes=notes)
+    data["notes"] = notes
+    data["complete"] = complete
+    data["written"] = datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC")
+    data["rtd3jax"] = versions_of(["rtd3jax"])["rtd3jax"]
+    return data
+
+
+def render(data: dict[str, Any]) -> str:
+    """The document. Nothing in ``data`` is read as HTML or as code."""
+    parts = importlib.resources.files("rtd3jax.study.report") / "page"
+    scripts = "\n".join((parts / f"{name}.js").read_text("utf-8") for name in _SCRIPTS)
+    pieces = {
+        "GENERATOR": _GENERATOR,
+        "TITLE": html.escape(str(data["title"])),
+        "STYLE": (parts / "page.css").read_text("utf-8"),
+        "DATA": _json_in_html(data),
+        "SCRIPT": f"(() => {{\n'use strict';\n{scripts}\n}})();",
+    }
+    document = (parts / "page.html").read_text("utf-8")
+    # Cut first, then joined, so that a run's own text is never searched for our marks.
+    found = document.split("@@")
+    return "".join(pieces[part] if index % 2 else part for index, part in enumerate(found))
+
+
+def _json_in_html(data: Any) -> str:
+    """JSON in which no character can end a script element."""
+    text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    for character in "<>&\u2028\u2029":
+        text = text.replace(character, f"\\u{ord(character):04x}")
+    # A file name may hold bytes that are no text.
+    return text.encode("utf-8", "replace").decode()
+
+
+def _check_ours(path: Path) -> None:
+    """Refuse to overwrite what is not a page of ours."""
+    try:
+        if os.path.lexists(path) and _GENERATOR not in path.read_text("utf-8", "replace")[:2000]:
+            raise UserError(f"{path} is not a page of rtd3jax; choose another --out")
+    except OSError as error:
+        raise UserError(f"{path} cannot be written: {error.strerror}") from error

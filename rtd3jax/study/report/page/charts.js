@@ -1,0 +1,85 @@
+// Scales, axes, and the words that appear beside the pointer.
+
+function ticks(low, high, count) {
+  const rough = (high - low) / Math.max(1, count);
+  const power = 10 ** Math.floor(Math.log10(rough));
+  const step = power * [1, 2, 2.5, 5, 10].find((factor) => factor * power >= rough * 0.999);
+  const found = [];
+  for (let k = Math.ceil(low / step - 1e-9); k * step <= high + step * 1e-9; k++) found.push(k * step);
+  return { values: found, decimals: Math.max(0, -Math.floor(Math.log10(step) + 1e-9) + (step / power === 2.5 ? 1 : 0)) };
+}
+
+const scale = (low, high, from, to) => (value) => from + ((value - low) / (high - low || 1)) * (to - from);
+
+// Limits around values, and which references lie near enough to have a line. One that is farther
+// away than the range of the values is named at the edge: its line would squash everything else.
+function limits(values, references) {
+  let kept = values.filter(finite);
+  if (!kept.length) kept = references.map((r) => r.value);
+  if (!kept.length) kept = [0];
+  let low = Math.min(...kept);
+  let high = Math.max(...kept);
+  const span = high - low || Math.max(Math.abs(high), 1) * 0.1;
+  const isNear = (r) => r.value >= low - span && r.value <= high + span;
+  const near = references.filter(isNear);
+  const far = references.filter((r) => !isNear(r)).map((r) => ({ ...r, above: r.value > high }));
+  low = Math.min(low, ...near.map((r) => r.value));
+  high = Math.max(high, ...near.map((r) => r.value));
+  const margin = 0.06 * (high - low || span);
+  return { low: low - margin, high: high + margin, near, far };
+}
+
+const DASHES = { random: '2 3', constant: '8 4', ceiling: null };
+
+function referencesOf(world, measure) {
+  const found = world.references.map((r) => ({ name: r.name, value: r[measure] }));
+  if (world.ceiling && finite(world.ceiling.mean)) {
+    const name = world.ceiling.kind === 'exact' ? 'ceiling' : 'ceiling (upper bound)';
+    found.push({ name, value: world.ceiling.mean, ceiling: true });
+  }
+  return found.filter((r) => finite(r.value));
+}
+const dashOf = (reference) => (reference.ceiling ? DASHES.ceiling : DASHES[reference.name]);
+
+function farWords(reference, decimals) {
+  return `${reference.above ? '\u2191' : '\u2193'} ${reference.name} ${fixed(reference.value, decimals)}`;
+}
+
+const tip = {
+  show(anchor, x, y, ...content) {
+    const box = byId('tip');
+    box.replaceChildren(...content.flat());
+    box.hidden = false;
+    const frame = anchor.getBoundingClientRect();
+    const width = document.documentElement.clientWidth;
+    const left = frame.left + x + 14;
+    const flipped = left + box.offsetWidth > width - 8 ? frame.left + x - box.offsetWidth - 14 : left;
+    box.style.left = `${Math.max(8, flipped) + window.scrollX}px`;
+    box.style.top = `${frame.top + y + 10 + window.scrollY}px`;
+  },
+  hide() { byId('tip').hidden = true; },
+};
+
+const swatch = (agent) => el('span', { class: 'swatch', style: `color: var(--a${agent})`, 'aria-hidden': 'true' });
+
+// A plot's frame: gridlines and numbers. x counts environment steps, y is a return.
+function axes({ width, height, x, y, label }) {
+  const marks = ticks(y[0], y[1], 4);
+  const texts = marks.values.map((value) => fixed(value, marks.decimals));
+  const left = 14 + 6.4 * Math.max(...texts.map((text) => text.length));
+  const frame = { left, right: width - 12, top: 8, bottom: height - 24, decimals: decimalsFor(y) };
+  frame.x = scale(x[0], x[1], frame.left, frame.right);
+  frame.y = scale(y[0], y[1], frame.bottom, frame.top);
+  const svg = draw('svg', { class: 'plot', width, height, viewBox: `0 0 ${width} ${height}`, role: 'img', 'aria-label': label });
+  marks.values.forEach((value, k) => {
+    const at = frame.y(value);
+    svg.append(draw('line', { class: 'grid', x1: frame.left, x2: frame.right, y1: at, y2: at }));
+    svg.append(draw('text', { x: frame.left - 6, y: at + 3.8, 'text-anchor': 'end' }, texts[k]));
+  });
+  for (const value of ticks(x[0], x[1] || 1, Math.max(2, Math.floor(width / 90))).values) {
+    const at = frame.x(value);
+    svg.append(draw('text', { x: at, y: height - 7, 'text-anchor': 'middle' }, compact(value)));
+  }
+  svg.append(draw('line', { class: 'axis', x1: frame.left, x2: frame.right, y1: frame.bottom, y2: frame.bottom }));
+  return { ...frame, svg };
+}

@@ -1,0 +1,145 @@
+// Learning curves: a panel for each disturbance and history length, a line with its band per agent.
+
+function curvePanels() {
+  const panels = [];
+  DATA.worlds.forEach((world, index) => {
+    const cells = shownCells().filter((cell) => cell.world === index);
+    if (!cells.length) return;
+    const lengths = [...new Set(cells.map((cell) => cell.length))].filter(Boolean).sort((a, b) => a - b);
+    const references = referencesOf(world, state.measure);
+    const curves = cells.map((cell) => cell.curves[state.measure]).filter(Boolean);
+    // One range for all lengths of a world, so that its panels can be compared. Early returns may
+    // be a hundred times worse than late ones: the lowest tenth of a curve's points may be cut off.
+    const lows = curves.flatMap((curve) => curve.low.map((low, k) => (finite(low) ? low : curve.iqm[k])));
+    const floor = quantile(lows, 0.1);
+    const kept = curves.flatMap((curve) => [...curve.low, ...curve.high, ...curve.iqm]).filter((value) => value >= floor);
+    const range = { ...limits(kept, references), cut: Math.min(...lows.filter(finite)) < floor };
+    for (const length of lengths.length ? lengths : [0]) {
+      const here = cells.filter((cell) => cell.length === 0 || cell.length === length);
+      panels.push({ world, length, cells: here, range });
+    }
+  });
+  return panels;
+}
+
+function quantile(values, share) {
+  const sorted = values.filter(finite).sort((a, b) => a - b);
+  return sorted.length ? sorted[Math.floor(share * (sorted.length - 1))] : -Infinity;
+}
+
+let clips = 0;
+
+function drawCurves() {
+  const section = byId('curves');
+  const panels = curvePanels();
+  section.querySelector('.about').textContent =
+    'Evaluation during training against environment steps: interquartile mean over the seeds, with ' +
+    'the 95 % bootstrap interval of that mean as a band. Point at a curve, or focus a panel and use ' +
+    'the arrow keys, to read it.' + (panels.some(({ range }) => range.cut) ? ' Early returns far below the others are cut off.' : '');
+  section.querySelector('.legend').replaceChildren(...legendItems(panels));
+  const body = section.querySelector('.body');
+  if (!panels.length) {
+    body.replaceChildren(el('p', { class: 'missing' }, 'Nothing is selected in the filter above.'));
+    return;
+  }
+  const columns = Math.max(1, Math.min(panels.length, Math.floor(body.clientWidth / 330)));
+  const width = Math.floor((body.clientWidth - (columns - 1) * 26) / columns);
+  const grid = el('div', { class: 'panels', style: `grid-template-columns: repeat(${columns}, minmax(0, 1fr))` });
+  grid.append(...panels.map((panel) => curvePanel(panel, width)));
+  body.replaceChildren(grid);
+}
+
+function legendItems(panels) {
+  const agents = [...new Set(panels.flatMap((panel) => panel.cells.map((cell) => cell.agent)))];
+  const items = agents.sort((a, b) => a - b).map((agent) => el('span', {}, swatch(agent), DATA.agents[agent].name));
+  const names = new Map();
+  for (const { range } of panels) for (const reference of range.near) names.set(reference.name, dashOf(reference));
+  for (const [name, dash] of names) {
+    const line = draw('line', { x1: 0, x2: 26, y1: 5, y2: 5, class: 'reference', 'stroke-dasharray': dash });
+    items.push(el('span', {}, draw('svg', { width: 26, height: 10, 'aria-hidden': 'true' }, line), name));
+  }
+  return items;
+}
+
+function curvePanel({ world, length, cells, range }, width) {
+  const title = [worldName(world), length ? lengthName(length) : null].filter(Boolean).join(', ');
+  const drawn = cells.filter((cell) => cell.curves[state.measure]);
+  const figure = el('figure', {}, el('figcaption', {}, title));
+  if (!drawn.length) {
+    figure.append(el('p', { class: 'missing' }, 'no evaluation yet'));
+    return figure;
+  }
+  const height = 230;
+  const last = Math.max(...drawn.map((cell) => Math.max(...cell.curves[state.measure].steps)));
+  const plot = axes({ width, height, x: [0, last], y: [range.low, range.high], label: title });
+  for (const reference of range.near) {
+    const y = plot.y(reference.value);
+    plot.svg.append(draw('line', { class: 'reference', x1: plot.left, x2: plot.right, y1: y, y2: y, 'stroke-dasharray': dashOf(reference) }));
+  }
+  const clip = `clip-${(clips += 1)}`;
+  plot.svg.append(draw('clipPath', { id: clip }, draw('rect', { x: plot.left, y: plot.top, width: plot.right - plot.left, height: plot.bottom - plot.top })));
+  plot.svg.append(draw('g', { 'clip-path': `url(#${clip})` }, drawn.map((cell) => curveLine(cell, plot))));
+  range.far.forEach((reference, k) => {
+    const words = farWords(reference, plot.decimals);
+    const y = reference.above ? plot.top + 12 + 13 * k : plot.bottom - 5 - 13 * k;
+    plot.svg.append(draw('text', { class: 'note', x: plot.right - 4, y, 'text-anchor': 'end' }, words));
+  });
+  readable(plot, drawn, title);
+  figure.append(plot.svg);
+  return figure;
+}
+
+function curveLine(cell, plot) {
+  const curve = cell.curves[state.measure];
+  const points = curve.steps.map((step, k) => ({ x: plot.x(step), k })).filter(({ k }) => finite(curve.iqm[k]));
+  const path = (values, list) => list.map(({ x, k }) => `${x.toFixed(1)},${plot.y(values[k]).toFixed(1)}`).join(' ');
+  const group = draw('g', { class: 'agent-line', style: `color: var(--a${cell.agent})`, 'data-agent': DATA.agents[cell.agent].name });
+  const banded = points.filter(({ k }) => finite(curve.low[k]) && finite(curve.high[k]));
+  if (banded.length > 1) {
+    const back = [...banded].reverse();
+    group.append(draw('polygon', { class: 'band', points: `${path(curve.high, banded)} ${path(curve.low, back)}` }));
+  }
+  if (points.length > 1) group.append(draw('polyline', { class: 'line', points: path(curve.iqm, points) }));
+  else points.forEach(({ x, k }) => group.append(draw('circle', { cx: x, cy: plot.y(curve.iqm[k]), r: 3, fill: 'currentColor' })));
+  return group;
+}
+
+// Hover, touch and arrow keys: the values at the nearest evaluation.
+function readable(plot, cells, title) {
+  const steps = [...new Set(cells.flatMap((cell) => cell.curves[state.measure].steps))].sort((a, b) => a - b);
+  const cross = draw('line', { class: 'cross', y1: plot.top, y2: plot.bottom, visibility: 'hidden' });
+  plot.svg.append(cross);
+  let at = steps.length - 1;
+  const show = (index) => {
+    at = Math.max(0, Math.min(steps.length - 1, index));
+    const x = plot.x(steps[at]);
+    fill(cross, { x1: x, x2: x, visibility: 'visible' });
+    const rows = cells
+      .map((cell) => ({ cell, curve: cell.curves[state.measure], k: cell.curves[state.measure].steps.indexOf(steps[at]) }))
+      .filter(({ k, curve }) => k >= 0 && finite(curve.iqm[k]))
+      .sort((a, b) => b.curve.iqm[b.k] - a.curve.iqm[a.k])
+      .map(({ cell, curve, k }) => {
+        const of = curve.seeds[k] < cell.seeds ? ` (${curve.seeds[k]} of ${cell.seeds} seeds)` : '';
+        const spread = finite(curve.low[k]) ? `${fixed(curve.low[k], plot.decimals)} to ${fixed(curve.high[k], plot.decimals)}` : '';
+        return el('tr', {}, el('td', {}, swatch(cell.agent), ` ${DATA.agents[cell.agent].name}${of}`),
+          el('td', { class: 'number' }, fixed(curve.iqm[k], plot.decimals)), el('td', { class: 'number' }, spread));
+      });
+    tip.show(plot.svg, x, plot.top, el('strong', {}, `${title}: step ${steps[at].toLocaleString('en')}`), el('table', {}, el('tbody', {}, rows)));
+  };
+  const hide = () => { cross.setAttribute('visibility', 'hidden'); tip.hide(); };
+  const nearest = (x) => steps.reduce((best, step, k) => (Math.abs(plot.x(step) - x) < Math.abs(plot.x(steps[best]) - x) ? k : best), 0);
+  fill(plot.svg, {
+    tabindex: 0,
+    onpointermove: (event) => show(nearest(event.clientX - plot.svg.getBoundingClientRect().left)),
+    onpointerleave: hide,
+    onfocus: () => { if (plot.svg.matches(':focus-visible')) show(at); },
+    onblur: hide,
+    onkeydown: (event) => {
+      const move = { ArrowLeft: -1, ArrowRight: 1, Home: -steps.length, End: steps.length }[event.key];
+      if (event.key === 'Escape') hide();
+      if (move === undefined) return;
+      event.preventDefault();
+      show(at + move);
+    },
+  });
+}

@@ -1,0 +1,69 @@
+// What is shown: sets of worlds, agents and history lengths, shared by curves, returns and table.
+
+const state = { worlds: new Set(), agents: new Set(), lengths: new Set(), measure: 'return' };
+
+const oneEnv = new Set(DATA.worlds.map((world) => world.env)).size === 1;
+function worldName(world) {
+  const name = world.disturbance === 'none' ? 'no disturbance' : world.disturbance;
+  return oneEnv ? name : `${world.env}: ${name}`;
+}
+const lengthName = (length) => (length ? `history ${length}` : 'no history');
+const cellName = (cell) =>
+  DATA.agents[cell.agent].name + (cell.length ? `, history ${cell.length}` : '');
+const allLengths = [...new Set(DATA.cells.map((cell) => cell.length))].filter(Boolean).sort((a, b) => a - b);
+
+// An agent without a window belongs beside every length.
+const isShown = (cell) =>
+  state.worlds.has(cell.world) && state.agents.has(cell.agent) &&
+  (cell.length === 0 || state.lengths.has(cell.length));
+const shownCells = () => DATA.cells.filter(isShown);
+
+function chips(legend, set, items, update) {
+  const boxes = items.map(({ value, label, agent }) => {
+    const input = el('input', { type: 'checkbox', name: legend, value: String(value) });
+    input.checked = set.has(value);
+    input.addEventListener('change', () => {
+      if (input.checked) set.add(value); else set.delete(value);
+      update();
+    });
+    const mark = agent === undefined ? null : swatch(agent);
+    return { input, value, node: el('label', { class: 'chip' }, input, mark, label) };
+  });
+  const all = el('button', { type: 'button', class: 'plain', 'aria-label': `all: ${legend}` }, 'all');
+  all.addEventListener('click', () => {
+    const fill = boxes.some((box) => !box.input.checked);
+    for (const box of boxes) {
+      box.input.checked = fill;
+      if (fill) set.add(box.value); else set.delete(box.value);
+    }
+    update();
+  });
+  return el('fieldset', {}, el('legend', {}, legend), boxes.map((box) => box.node), items.length > 2 ? all : null);
+}
+
+function measureChoice(update) {
+  const inputs = DATA.measures.map(([name, words]) => {
+    const input = el('input', { type: 'radio', name: 'measure', value: name });
+    input.checked = name === state.measure;
+    input.addEventListener('change', () => { state.measure = name; update(); });
+    return el('label', { class: 'chip' }, input, words);
+  });
+  return el('fieldset', {}, el('legend', {}, 'return'), inputs);
+}
+
+function startFilters(update) {
+  DATA.agents.forEach((_, index) => state.agents.add(index));
+  allLengths.forEach((length) => state.lengths.add(length));
+  // A large study opens on its first worlds: some dozen panels.
+  const panels = Math.max(1, allLengths.length);
+  const first = Math.max(1, Math.floor(12 / panels));
+  DATA.worlds.forEach((_, index) => { if (index < first) state.worlds.add(index); });
+  const form = byId('filters').querySelector('form');
+  form.addEventListener('submit', (event) => event.preventDefault());
+  form.append(chips('disturbance', state.worlds, DATA.worlds.map((world, value) => ({ value, label: worldName(world) })), update));
+  form.append(chips('agent', state.agents, DATA.agents.map((agent, value) => ({ value, label: agent.name, agent: value })), update));
+  if (allLengths.length) {
+    form.append(chips('history length', state.lengths, allLengths.map((value) => ({ value, label: String(value) })), update));
+  }
+  if (DATA.measures.length > 1) form.append(measureChoice(update));
+}

@@ -1,0 +1,81 @@
+// The same numbers as a table that sorts.
+
+const sorting = { column: null, descending: false };
+
+// How far from the uniform-random policy (0) to the ceiling (1) a return is.
+function normalised(value, world) {
+  const references = referencesOf(world, state.measure);
+  const random = references.find((r) => r.name === 'random');
+  const best = references.find((r) => r.ceiling);
+  return random && best && finite(value) ? (value - random.value) / (best.value - random.value) : null;
+}
+
+function tableColumns(decimals) {
+  const final = (row) => row.final || {};
+  const numeric = (name, value, places = decimals) => ({ name, number: true, value, text: (row) => fixed(value(row), places) });
+  return [
+    { name: 'disturbance', value: (row) => worldName(row.world), text: (row) => worldName(row.world) },
+    { name: 'policy', value: (row) => row.name, text: (row) => (row.cell ? el('span', { class: 'agent' }, swatch(row.cell.agent), row.name) : row.name) },
+    { name: 'history', number: true, value: (row) => (row.cell ? row.cell.length : null), text: (row) => (row.cell ? (row.cell.length || DASH) : DASH) },
+    { name: 'seeds', number: true, value: (row) => final(row).n, text: (row) => (row.cell ? `${final(row).n || 0} of ${row.cell.seeds}` : DASH) },
+    numeric('IQM', (row) => final(row).iqm),
+    { name: '95 % interval', value: (row) => final(row).low, number: true,
+      text: (row) => (finite(final(row).low) ? `${fixed(final(row).low, decimals)} to ${fixed(final(row).high, decimals)}` : DASH) },
+    numeric('mean', (row) => final(row).mean),
+    numeric('std', (row) => final(row).std),
+    numeric('normalised', (row) => normalised(final(row).mean, row.world), 3),
+    { name: 'state', value: (row) => (row.cell ? stateOf(row.cell) : ''), text: (row) => (row.cell ? stateOf(row.cell) : '') },
+  ];
+}
+
+function stateOf(cell) {
+  const final = cell.final[state.measure];
+  const lost = final && final.lost ? `, ${final.lost} lost` : '';
+  const ended = final ? final.n + final.lost : 0;
+  if (ended === cell.seeds) return `done${lost}`;
+  return cell.begun ? `under way${lost}` : 'planned';
+}
+
+function tableRows() {
+  const rows = shownCells().map((cell) => ({ cell, world: DATA.worlds[cell.world], name: DATA.agents[cell.agent].name, final: cell.final[state.measure] }));
+  DATA.worlds.forEach((world, index) => {
+    if (!state.worlds.has(index)) return;
+    for (const reference of referencesOf(world, state.measure)) {
+      rows.push({ cell: null, world, name: reference.name, final: { mean: reference.value, iqm: null } });
+    }
+  });
+  return rows;
+}
+
+function drawTable() {
+  const section = byId('table');
+  section.querySelector('.about').textContent =
+    'Final returns; a heading sorts. Normalised: 0 is the uniform-random policy, 1 is the ceiling, the best that any policy can reach.';
+  const rows = tableRows();
+  const columns = tableColumns(decimalsFor(rows.map((row) => row.final && row.final.mean)));
+  if (sorting.column !== null) {
+    const { value } = columns[sorting.column];
+    const sign = sorting.descending ? -1 : 1;
+    const missing = (v) => v === null || v === undefined || v === '';
+    rows.sort((a, b) => {
+      const [one, other] = [value(a), value(b)];
+      if (missing(one) || missing(other)) return missing(one) - missing(other);
+      return sign * (typeof one === 'number' ? one - other : String(one).localeCompare(String(other)));
+    });
+  }
+  const heads = columns.map((column, index) => {
+    const chosen = sorting.column === index;
+    const sort = chosen ? (sorting.descending ? 'descending' : 'ascending') : 'none';
+    const press = () => {
+      sorting.descending = chosen ? !sorting.descending : Boolean(column.number);
+      sorting.column = index;
+      drawTable();
+      section.querySelectorAll('th button')[index].focus();
+    };
+    return el('th', { scope: 'col', class: column.number ? 'number' : null, 'aria-sort': sort }, el('button', { type: 'button', onclick: press }, column.name));
+  });
+  const lines = rows.map((row) => el('tr', { class: row.cell ? null : 'reference' },
+    columns.map((column) => el('td', { class: column.number ? 'number' : null }, column.text(row)))));
+  const table = el('table', { class: 'data' }, el('thead', {}, el('tr', {}, heads)), el('tbody', {}, lines));
+  section.querySelector('.body').replaceChildren(el('div', { class: 'scroll', tabindex: 0, role: 'region', 'aria-label': 'Final returns' }, table));
+}

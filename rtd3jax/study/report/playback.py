@@ -1,0 +1,240 @@
+"""Episodes of trained policies, step by step, small enough to travel inside the page.
+
+Frame t is what followed from the t-th action: the observation that the agent saw next, the true one
+behind it, the action, its reward, and (rover) the slip that it met.
+"""
+
+import base64
+import dataclasses
+import functools
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+
+from rtd3jax.envs.disturbances import Hidden
+from rtd3jax.envs.disturbed import Disturbed
+from rtd3jax.envs.interface import foreign_code
+from rtd3jax.envs.pendulum import Pendulum
+from rtd3jax.envs.process import Chain
+from rtd3jax.envs.rover import Rover
+from rtd3jax.errors import UserError
+from rtd3jax.evaluate import DEFAULT_STEP_LIMIT
+from rtd3jax.files import write_bytes_atomically
+from rtd3jax.study.plan import Cell
+from rtd3jax.study.report.data import number
+from rtd3jax.study.results import CELL
+from rtd3jax.study.rundir import RunDirectory
+
+FORMAT = 1
+EPISODES = 2
+SEED = 0
+"""Of the episodes, the same for all agents: in one world they meet the same disturbance."""
+MOST_STEPS = 500
+"""Steps of an episode that are kept."""
+MOST_CELLS = 60
+"""Cells with two episodes each; in a larger study each has one, so that the page stays small."""
+
+_NAMES = {
+    "pendulum": ["cos θ", "sin θ", "angular velocity"],
+    "rover": ["speed error", "yaw-rate error"],
+}
+
+
+def recordings(
+    directory: RunDirectory, lanes: pd.DataFrame, *, record: bool, notes: list[str]
+) -> list[dict[str, Any]]:
+    """A recording of every cell that has a trained policy, in the order of cells.
+
+    ``lanes`` are the `seed_means` of the final evaluation, by which the seed is chosen.
+    Kept in ``playback/`` beside the lanes, and made anew when the lane's file is another. Without
+    ``record``, only those that are kept.
+    """
+    count = EPISODES if len(directory.cells) <= MOST_CELLS else 1
+    longest = max(cell.config.history_length or 0 for cell in directory.cells)
+    found: list[dict[str, Any]] = []
+    problems: dict[str, list[str]] = {}
+    for index, cell in enumerate(directory.cells):
+        seed = _middle_seed(directory, cell, lanes)
+        if seed is None:
+            continue
+        digest = hashlib.sha256(directory.lane_path(cell, seed).read_bytes()).hexdigest()
+        stamp = {"format": FORMAT, "lane": digest, "episodes": count}
+        path = directory.playback_path(cell, seed)
+        kept = _read(path, stamp)
+        if kept is None and record:
+            try:
+                kept = {**stamp, **_recorded(directory, cell, seed, longest, count)}
+            except UserError as error:
+                problems.setdefault(str(error), []).append(path.stem)
+                continue
+            write_bytes_atomically(path, json.dumps(kept).encode())
+        if kept is not None:
+            shown = {name: value for name, value in kept.items() if name not in stamp}
+            found.append({"cell": index, "seed": seed, **shown})
+    notes += [f"no playback of {', '.join(names)}: {why}" for why, names in problems.items()]
+    return found
+
+
+def record_episodes(
+    policy: Any, env: Any, episodes: int, seed: int, steps: int
+) -> dict[str, np.ndarray]:
+    """Play ``episodes`` of ``steps`` at most: arrays [episodes, steps, ...] by name.
+
+    Episodes are those of ``evaluate(policy, env, episodes, seed)``. ``done`` says in which frame an
+    episode ended; later frames mean nothing.
+    """
+    return {
+        name: np.asarray(value)
+        for name, value in _play(
+            policy, env, env.default_params, jax.random.key(seed), episodes, steps
+        ).items()
+    }
+
+
+@functools.partial(jax.jit, static_argnames=("env", "episodes", "steps"))
+def _play(policy, env, params, key, episodes, steps):
+    policy_key, reset_key, step_key = jax.random.split(key, 3)
+    with foreign_code():
+        observation, state = jax.vmap(env.reset, in_axes=(0, None))(
+            jax.random.split(reset_key, episodes), params
+        )
+    memory = jax.vmap(policy.init)(jax.random.split(policy_key, episodes))
+
+    def step(loop, time):
+        memory, state, observation = loop
+        action, memory = jax.vmap(policy.step)(memory, observation)
+        slip = _slip_of(env, state)
+        keys = jax.random.split(jax.random.fold_in(step_key, time), episodes)
+        with foreign_code():
+            observation, state, reward, terminated, truncated, info = jax.vmap(
+                env.step, in_axes=(0, 0, 0, None)
+            )(keys, state, action, params)
+        seen = info["final_observation"].astype(jnp.float32)
+        frame = {
+            "seen": seen,
+            "true": jnp.asarray(info.get("true_observation", seen), jnp.float32),
+            "action": action.reshape(episodes, -1).astype(jnp.float32),
+            "reward": reward.astype(jnp.float32)[:, None],
+            "done": terminated.astype(bool) | truncated.astype(bool),
+        }
+        if slip is not None:
+            frame["slip"] = slip
+        return (memory, state, observation.astype(jnp.float32)), frame
+
+    start = (memory, state, observation.astype(jnp.float32))
+    _, frames = jax.lax.scan(step, start, jnp.arange(steps, dtype=jnp.int32))
+    return {name: jnp.swapaxes(value, 0, 1) for name, value in frames.items()}
+
+
+def _slip_of(env: Any, state: Any) -> Any:
+    """The slip [..., 2] that a rover's next command meets; None where there is none."""
+    base, state = (env.base, state.env) if isinstance(env, Disturbed) else (env, state)
+    if not isinstance(base, Rover):
+        return None
+    parts = state.slip if type(state.slip) is tuple else (state.slip,)
+    return next((part.slip for part in parts if hasattr(part, "slip")), None)
+
+
+def _recorded(
+    directory: RunDirectory, cell: Cell, seed: int, longest: int, count: int
+) -> dict[str, Any]:
+    env, policy = cell.make_env(), directory.policy(cell, seed)
+    if policy.tokens:
+        # One window for all lengths, so that they share a program; a policy minds its own length.
+        policy = dataclasses.replace(policy, tokens=longest)
+    limit = int(getattr(env.default_params, "max_steps_in_episode", DEFAULT_STEP_LIMIT))
+    try:
+        frames = record_episodes(policy, env, count, SEED, min(limit, MOST_STEPS))
+    except UserError:
+        raise
+    except Exception as error:  # a user's environment may do anything
+        raise UserError((str(error).splitlines() or [type(error).__name__])[0]) from error
+    cut = limit > MOST_STEPS and not frames["done"].any(axis=1).all()
+    return {
+        **_scene(env, frames["seen"].shape[-1], frames["true"].shape[-1]),
+        "cut": MOST_STEPS if cut else None,
+        "runs": [_packed({n: value[k] for n, value in frames.items()}) for k in range(count)],
+    }
+
+
+def _scene(env: Any, seen: int, true: int) -> dict[str, Any]:
+    """What the drawing has to know: kind of world, names of elements, and constants."""
+    params, base, elements = env.default_params, env, list(range(true))
+    if isinstance(env, Disturbed):
+        base, process, params = env.base, params.process, params.env
+        processes = process.processes if isinstance(process, Chain) else (process,)
+        for part in processes:
+            if isinstance(part, Hidden):
+                del elements[part.element]
+    # Which true element each seen one shows; None where that is not known.
+    known = elements if len(elements) == seen else None
+    if isinstance(base, Pendulum):
+        return {
+            "kind": "pendulum",
+            "names": _NAMES["pendulum"],
+            "elements": known,
+            "seconds": number(params.dt),
+            "constants": {"max_torque": number(params.max_torque)},
+        }
+    if isinstance(base, Rover):
+        names = ("wheelbase", "target_speed", "target_yaw_rate")
+        constants = {name: number(getattr(params, name)) for name in names}
+        return {
+            "kind": "rover",
+            "names": _NAMES["rover"],
+            "elements": known,
+            "seconds": None,  # the rover's step has no length; the page says what it draws
+            "constants": constants,
+        }
+    names_of = [f"o[{k}]" for k in range(true)]
+    return {
+        "kind": None,
+        "names": names_of,
+        "elements": known,
+        "seconds": None,
+        "constants": {},
+    }
+
+
+def _packed(frames: dict[str, np.ndarray]) -> dict[str, Any]:
+    """One episode's frames up to its end: 16 bits a number, a scale for each element."""
+    done = np.flatnonzero(frames.pop("done"))
+    length = int(done[0]) + 1 if done.size else len(frames["reward"])
+    packed: dict[str, Any] = {"steps": length}
+    if np.array_equal(frames["seen"], frames["true"]):
+        frames.pop("seen")  # the agent sees the truth
+    for name, values in frames.items():
+        values = values[:length].astype(np.float64)
+        if not np.all(np.isfinite(values)):
+            raise UserError(f"the {name} of an episode is not finite")
+        scale = np.maximum(np.abs(values).max(axis=0), 1e-9) / 32_767
+        data = np.round(values / scale).astype("<i2")
+        packed[name] = {
+            "scale": [float(f"{s:.6g}") for s in scale],
+            "data": base64.b64encode(data.tobytes()).decode(),
+        }
+    return packed
+
+
+def _middle_seed(directory: RunDirectory, cell: Cell, lanes: pd.DataFrame) -> int | None:
+    """The seed whose final return is the cell's median (the lower one of two): a typical agent."""
+    rows = lanes[(lanes[list(CELL)] == list(cell.key.values())).all(axis=1)]
+    rows = rows[np.isfinite(rows["return"])].sort_values(["return", "seed"])
+    seeds = [int(seed) for seed in rows["seed"] if directory.is_done(cell, int(seed))]
+    return seeds[(len(seeds) - 1) // 2] if seeds else None
+
+
+def _read(path: Path, stamp: dict[str, Any]) -> dict[str, Any] | None:
+    try:
+        content = json.loads(path.read_text())
+        if all(content[name] == value for name, value in stamp.items()) and content["runs"]:
+            return content
+    except (OSError, ValueError, KeyError, TypeError):
+        pass  # none, or another's
+    return None

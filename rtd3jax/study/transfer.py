@@ -1,0 +1,77 @@
+"""What the trained agents of a run score under other disturbances than their own."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from rtd3jax.envs.registry import make, parse_disturbance
+from rtd3jax.errors import UserError
+from rtd3jax.evaluate import evaluate
+from rtd3jax.files import write_bytes_atomically
+from rtd3jax.study.report.transfer import COLUMNS, FILE
+from rtd3jax.study.rundir import RunDirectory
+
+
+def transfer(
+    directory: RunDirectory,
+    tested_on: Sequence[str] | None,
+    episodes: int,
+    say: Callable[[str], None] = print,
+) -> pd.DataFrame:
+    """Test every trained policy of ``directory`` and keep the returns in ``transfer.parquet``.
+
+    Args:
+        directory: the run.
+        tested_on: disturbances; by default those of the run, for each environment its own.
+        episodes: for each policy and disturbance. A lane's seed is also that of its episodes, so
+            that agents of one seed meet the same ones.
+        say: takes a line where a disturbance does not suit some policies.
+
+    Raises:
+        UserError: for an unknown disturbance, or when nothing is trained yet.
+    """
+    rows: list[dict[str, Any]] = []
+    worlds: dict[tuple[str, str], Any] = {}
+    problems: dict[tuple[str, str, str], list[int]] = {}
+    for cell in directory.cells:
+        own = list(dict.fromkeys(c.disturbance for c in directory.cells if c.env == cell.env))
+        for disturbance in own if tested_on is None else tested_on:
+            world = cell.env, disturbance
+            if world not in worlds:
+                name, parameters = parse_disturbance(disturbance)
+                worlds[world] = make(cell.env, name, **parameters)
+            for seed in directory.seeds:
+                try:
+                    if not directory.is_done(cell, seed):
+                        continue
+                    policy = directory.policy(cell, seed)
+                    returns = evaluate(policy, worlds[world], episodes, seed)
+                except UserError as error:
+                    problems.setdefault((cell.disturbance, disturbance, str(error)), []).append(
+                        seed
+                    )
+                    continue
+                rows += [
+                    {
+                        "env": cell.env,
+                        "algorithm": cell.config.algorithm,
+                        "history_length": cell.config.history_length or 0,
+                        "trained_on": cell.disturbance,
+                        "tested_on": disturbance,
+                        "seed": seed,
+                        "episode": episode,
+                        "return": float(value),
+                    }
+                    for episode, value in enumerate(np.asarray(returns))
+                ]
+    for (trained_on, tested, reason), seeds in problems.items():
+        say(f"not tested on {tested}: {len(seeds)} agents trained on {trained_on}: {reason}")
+    if not rows:
+        raise UserError(
+            f"nothing in {directory.path} could be tested: --status tells what there is"
+        )
+    table = pd.DataFrame(rows, columns=list(COLUMNS))
+    write_bytes_atomically(directory.path / FILE, table.to_parquet(index=False))
+    return table

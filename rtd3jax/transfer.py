@@ -1,0 +1,67 @@
+"""``python -m rtd3jax.transfer RUN``: test trained agents under other disturbances than their own.
+
+Writes RUN/transfer.parquet (a row per policy, disturbance and episode), draws it into the page of
+the run, and prints the mean return of each agent. Repeating the command replaces the table.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from rtd3jax.errors import UserError
+from rtd3jax.study.report.page import NAME, refresh_page
+from rtd3jax.study.rundir import RunDirectory
+from rtd3jax.study.transfer import transfer
+from rtd3jax.study.worlds import import_worlds
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; the exit status: 0 done, 2 bad input."""
+    options = _parser().parse_args(arguments)
+    try:
+        for module in options.imports:
+            import_worlds(module)
+        directory = RunDirectory.open(options.run)
+        rows = transfer(directory, options.on, options.episodes)
+        page = directory.path / NAME
+        refresh_page(directory, complete=not page.exists())
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        print(f"error: {error.filename or options.run}: {error.strerror}", file=sys.stderr)
+        return 2
+    lanes = ["env", "algorithm", "history_length", "trained_on"]
+    means = rows.pivot_table(index=lanes, columns="tested_on", values="return", sort=False)
+    print(means.round(3).to_string())
+    print(f"results: {directory.path / 'transfer.parquet'}, {page}")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m rtd3jax.transfer",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog="example:\n  python -m rtd3jax.transfer runs/rover --on ar1-slip ar1-slip-fast",
+    )
+    parser.add_argument("run", help="a run directory")
+    parser.add_argument(
+        "--on", nargs="+", metavar="ID", help="disturbances to test on [all those of the run]"
+    )
+    parser.add_argument(
+        "--episodes", type=int, default=100, help="of each policy and disturbance [100]"
+    )
+    parser.add_argument(
+        "--import",
+        dest="imports",
+        action="append",
+        default=[],
+        metavar="MODULE",
+        help="a Python module that registers worlds (rtd3jax.register)",
+    )
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

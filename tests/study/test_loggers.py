@@ -1,0 +1,101 @@
+"""Each tracker gets every evaluation of every lane, without a network."""
+
+import struct
+
+import pytest
+
+from rtd3jax import sweep
+from rtd3jax.errors import UserError
+from rtd3jax.study import loggers
+from rtd3jax.study.loggers import METRIC, check_loggers, open_loggers
+from rtd3jax.study.plan import Grid, make_cells
+from rtd3jax.study.rundir import RunDirectory
+
+ROWS = [(20, -3.5), (40, None), (60, -1.25)]
+
+
+@pytest.fixture
+def directory(tmp_path):
+    cells = make_cells([Grid("rover", ("ar1-slip",), ("td3", "h-td3"), (1,))], {})
+    return RunDirectory(tmp_path / "run", cells, [0, 1], 2)
+
+
+def feed(name, directory, rows=ROWS):
+    with open_loggers([name], directory) as logger:
+        for cell in directory.cells:
+            for seed in directory.seeds:
+                for step, value in rows:
+                    logger.log(cell, seed, {"step": step, "return": value})
+
+
+def test_tensorboard(directory):
+    pytest.importorskip("tensorboardX")
+    from tensorboardX.proto.event_pb2 import Event
+
+    feed("tensorboard", directory)
+    files = sorted((directory.path / "tensorboard").glob("*/seed-*/events*"))
+    assert len(files) == 4
+    for file in files:
+        data, points = file.read_bytes(), []
+        while data:  # records: length, its checksum, an event, its checksum
+            (length,) = struct.unpack("<Q", data[:8])
+            event = Event.FromString(data[12 : 12 + length])
+            points += [(event.step, v.tag, v.simple_value) for v in event.summary.value]
+            data = data[16 + length :]
+        assert points == [(20, METRIC, -3.5), (60, METRIC, -1.25)]
+
+
+def test_mlflow_goes_on_in_the_run_of_a_lane(directory):
+    pytest.importorskip("mlflow")
+    from mlflow import MlflowClient
+
+    feed("mlflow", directory, ROWS[:1])
+    feed("mlflow", directory, ROWS[1:])
+    client = MlflowClient(f"sqlite:///{directory.path / 'mlflow.db'}")
+    runs = client.search_runs([client.get_experiment_by_name("run").experiment_id])
+    assert len(runs) == 4
+    for run in runs:
+        points = client.get_metric_history(run.info.run_id, METRIC)
+        assert [(p.step, p.value) for p in points] == [(20, -3.5), (60, -1.25)]
+        assert run.data.params["env"] == "rover"
+
+
+def test_wandb_offline(directory, monkeypatch):
+    pytest.importorskip("wandb")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    feed("wandb", directory)
+    files = list((directory.path / "wandb").glob("offline-run-*/*.wandb"))
+    assert len(files) == 4
+    for file in files:
+        content = file.read_bytes()
+        assert METRIC.encode() in content and b"-1.25" in content
+
+
+def test_a_sweep_feeds_them(tmp_path, monkeypatch):
+    rows = []
+
+    class Fake:
+        def __init__(self, directory):
+            pass
+
+        def log(self, cell, seed, row):
+            rows.append((cell.config.algorithm, seed, row["step"]))
+
+        def close(self):
+            rows.append("closed")
+
+    monkeypatch.setitem(loggers.LOGGERS, "tensorboard", ("json", Fake))
+    monkeypatch.setattr(sweep, "references_of", lambda cells: [])
+    study = "--env rover --algorithms td3 --seeds 2 --total-steps 40 --hidden-size 4 --quiet "
+    study += "--batch-size 4 --learning-starts 10 --eval-every 20 --eval-episodes 1 --no-report"
+    command = [*study.split(), "--out", str(tmp_path / "run"), "--log", "tensorboard"]
+    assert sweep.main(command) == 0
+    assert rows.pop() == "closed"
+    assert sorted(rows) == [("td3", s, step) for s in (0, 1) for step in (20, 40)]
+
+
+def test_what_is_not_installed_is_named(monkeypatch):
+    monkeypatch.setitem(loggers.LOGGERS, "wandb", ("no_such_package", None))
+    with pytest.raises(UserError, match=r"pip install 'rtd3jax\[wandb\]'"):
+        check_loggers(["wandb"])

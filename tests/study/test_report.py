@@ -1,0 +1,210 @@
+"""The page of a run: what is in it, what it does in a browser, what it says is missing."""
+
+import json
+import os
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+from browser import chromium
+from random_policies import random_policy
+
+import rtd3jax as rtd
+from rtd3jax import report, transfer
+from rtd3jax.ceilings import Ceiling
+from rtd3jax.study.plan import Grid, make_cells
+from rtd3jax.study.report import ceilings
+from rtd3jax.study.report.playback import record_episodes
+from rtd3jax.study.rundir import Reference, RunDirectory
+
+AGENTS = ("td3", "lstm-td3-1ha1hc")
+GRIDS = {
+    "rover": Grid("rover", ("ar1-slip", "sine-slip+dropout:p=0.3"), AGENTS, (1, 2)),
+    "pendulum": Grid("pendulum", ("random-sine",), AGENTS, (1, 2)),
+}
+STEPS = [20, 40, 60]
+
+
+def make_run(out, grid):
+    """A finished run of untrained agents with invented curves: nothing is compiled for it."""
+    settings = {"total_steps": 60, "hidden_size": 8, "eval_every": 20, "batch_size": 8}
+    settings |= {"learning_starts": 10}
+    directory = RunDirectory(out, make_cells([grid], settings), [0, 1], 2)
+    chance = np.random.default_rng(0)
+    for cell in directory.cells:
+        for seed in directory.seeds:
+            length = cell.config.history_length
+            policy = random_policy(cell.config.algorithm, cell.make_env(), length=length, seed=seed)
+            curves = {"steps": np.array(STEPS), "returns": chance.normal(-3, 1, 3)}
+            final = chance.normal(-2, 1, 2)
+            curves |= {"true_returns": curves["returns"], "final_returns": final}
+            directory.write_lane(
+                cell, seed, policy.actor, {**curves, "final_true_returns": final}, None
+            )
+    chance = np.random.default_rng(1)
+    references = [
+        Reference(env, disturbance, "random", *chance.normal(-4, 1, (2, 3)))
+        for env, disturbance in {(cell.env, cell.disturbance): 0 for cell in directory.cells}
+    ]
+    directory.derive(references, pictures=False)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """A small run of each world, with its page and (rover) its transfer matrix."""
+    found = {}
+    with pytest.MonkeyPatch.context() as patch:
+        best = Ceiling(-1.2, 0.1, "upper bound")
+        patch.setattr(ceilings, "ceiling", lambda env: best)  # the pendulum's takes seconds
+        for env, grid in GRIDS.items():
+            out = found[env] = tmp_path_factory.mktemp("page") / env
+            make_run(out, grid)
+            assert report.main([str(out)]) == 0
+        on = GRIDS["rover"].disturbances[1]
+        assert transfer.main([str(found["rover"]), "--episodes", "2", "--on", on]) == 0
+    return found
+
+
+def data_of(run):
+    text = (run / "report.html").read_text()
+    return json.loads(re.search(r'id="data">(.*?)</script>', text, re.S)[1])
+
+
+def rows_of(table, key):
+    return table[(table[list(key)] == list(key.values())).all(axis=1)]
+
+
+def test_the_numbers_are_those_of_the_tables(runs):
+    data = data_of(runs["rover"])
+    assert data["notes"] == [] and data["status"] == {"done": 12}
+    episodes = pd.read_parquet(runs["rover"] / "episodes.parquet")
+    curves = pd.read_parquet(runs["rover"] / "curves.parquet")
+    for cell in data["cells"]:
+        name = data["agents"][cell["agent"]]["name"]
+        world = data["worlds"][cell["world"]]["disturbance"]
+        key = {"algorithm": name, "disturbance": world, "history_length": cell["length"]}
+        final = rows_of(episodes, key).groupby("seed")["return"].mean()
+        assert cell["final"]["return"]["mean"] == pytest.approx(final.mean(), rel=1e-4)
+        points = rows_of(curves, key).groupby("step")["return"].mean()
+        assert cell["curves"]["return"]["steps"] == STEPS
+        assert cell["curves"]["return"]["iqm"] == pytest.approx(points.tolist(), rel=1e-4)
+    assert data["worlds"][0]["ceiling"]["kind"] == "upper bound"
+    on = GRIDS["rover"].disturbances
+    matrix = {(t["trained_on"], t["tested_on"]) for t in data["transfer"]}
+    assert matrix == {(on[0], on[1]), (on[1], on[1])}
+
+
+def test_playback_is_what_the_policy_does(runs):
+    directory = RunDirectory.open(runs["pendulum"])
+    cell = directory.cells[-1]
+    policy, env = directory.policy(cell, 0), cell.make_env()
+    frames = record_episodes(policy, env, 2, 5, 200)
+    assert frames["done"][:, -1].all() and not frames["done"][:, :-1].any()
+    totals = frames["reward"][..., 0].sum(axis=1)
+    np.testing.assert_allclose(totals, rtd.evaluate(policy, env, 2, 5), rtol=1e-5)
+    assert not np.allclose(frames["seen"], frames["true"])
+
+
+def test_the_page_needs_no_network_and_is_small(runs):
+    for run in runs.values():
+        page = (run / "report.html").read_text()
+        assert len(page) < 2_000_000
+        assert not re.search(r'(src|href)="(?!#|data:)', page) and "import(" not in page
+
+
+@pytest.mark.parametrize("env", sorted(GRIDS))
+def test_in_a_browser(env, runs):
+    with chromium() as browser:
+        page = browser.new_page(viewport={"width": 1200, "height": 900})
+        troubles, requests = [], []
+        page.on("console", lambda message: troubles.append(message.text))
+        page.on("pageerror", lambda error: troubles.append(str(error)))
+        page.on("request", lambda request: requests.append(request.url))
+        page.goto((runs[env] / "report.html").as_uri())
+        lines = page.locator("#curves .agent-line")
+        before = lines.count()
+        assert before == 4 * len(GRIDS[env].disturbances)  # two agents in two panels of each world
+
+        # A filter changes the curves; the keyboard does it too.
+        page.locator("#filters label", has_text="td3").first.click()
+        assert lines.count() == before // 2
+        page.locator("#filters input[value='0'][name='agent']").press("Space")
+        assert lines.count() == before
+
+        # Arrow keys read a curve.
+        plot = page.locator("#curves svg.plot").first
+        plot.focus()
+        plot.press("ArrowLeft")
+        assert "step 40" in page.locator("#tip").inner_text()
+
+        # A heading sorts.
+        head = page.locator("#table th button", has_text="mean")
+        head.click()
+        column = page.locator("#table tbody tr td:nth-child(7)").all_inner_texts()
+        values = [float(t.replace("−", "-").replace(",", "")) for t in column]
+        assert values == sorted(values, reverse=True)
+        assert page.locator("th[aria-sort='descending']").count() == 1
+
+        # Playback moves, and can be dragged.
+        moving = {"pendulum": ".scene line.truth", "rover": ".scene g"}[env]
+        picture = page.locator(moving).first
+        still = picture.evaluate("node => node.outerHTML")
+        page.locator("#play").click()
+        for _ in range(100):
+            if "step 1 of" not in page.locator("#clock").inner_text():
+                break
+            page.wait_for_timeout(50)
+        assert picture.evaluate("node => node.outerHTML") != still
+        page.locator("#play").click()
+        page.locator("#scrub").fill("150")
+        assert page.locator("#clock").inner_text() == "step 151 of 200"
+
+        # On a phone nothing is wider than the screen; in the dark the paper is dark.
+        page.set_viewport_size({"width": 375, "height": 700})
+        page.emulate_media(color_scheme="dark")
+        page.wait_for_timeout(300)
+        assert page.evaluate("document.documentElement.scrollWidth") <= 375
+        colour = page.evaluate("getComputedStyle(document.body).backgroundColor")
+        assert max(map(int, re.findall(r"\d+", colour)[:3])) < 60
+        if pictures := os.environ.get("RTD3JAX_PAGE_PICTURES"):
+            page.screenshot(path=f"{pictures}/{env}-phone.png", full_page=True)
+        assert troubles == [] and len(requests) == 1
+
+
+def test_an_unfinished_run_has_a_page_that_says_so(runs, tmp_path, monkeypatch):
+    monkeypatch.setattr(ceilings, "ceiling", lambda env: Ceiling(-1.2, 0.1, "exact"))
+    study = json.loads((runs["rover"] / "config.json").read_text())
+    hostile = tmp_path / "<script>alert(1)<"
+    hostile.mkdir()
+    (hostile / "config.json").write_text(json.dumps(study))
+    assert report.main([str(hostile)]) == 0
+    page = (hostile / "report.html").read_text()
+    assert "<script>alert" not in page
+    data = data_of(hostile)
+    assert data["status"] == {"planned": 12}
+    assert any("curves.parquet" in note for note in data["notes"])
+    assert data["transfer"] is None and data["playback"] == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(["nowhere"], "there is no study"), (["RUN", "--out", "thesis.html"], "is not a page")],
+)
+def test_bad_input_is_one_line(arguments, message, runs, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "thesis.html").write_text("mine")
+    arguments = [str(runs["rover"]) if a == "RUN" else a for a in arguments]
+    assert report.main(arguments) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and message in error and error.count("\n") == 1
+    assert (tmp_path / "thesis.html").read_text() == "mine"
+
+
+def test_transfer_names_what_does_not_fit(runs, capsys):
+    run = str(runs["pendulum"])
+    assert transfer.main([run, "--on", "hidden", "--episodes", "1"]) == 2
+    captured = capsys.readouterr()
+    assert "3 observation elements" in captured.out and "nothing in" in captured.err
+    assert transfer.main([run, "--on", "nose"]) == 2
+    assert "did you mean 'noise'" in capsys.readouterr().err
