@@ -26,12 +26,13 @@ from rtd3jax import sweep
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
 
-STEPS = 20_000
+STEPS = 40_000
 SETTINGS = {
     "gamma": 0.0,
     "reward_scale": 10.0,
+    "critic_learning_rate": 3e-3,
+    "actor_learning_rate": 3e-4,
     "final_learning_rate_fraction": 0.0,
-    "replay_capacity": 10_000,
     "precision": "float32",
 }
 HISTORY_LENGTH = 1

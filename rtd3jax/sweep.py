@@ -17,7 +17,9 @@ import jax
 
 from rtd3jax.errors import UserError
 from rtd3jax.study import options as given
+from rtd3jax.study.cluster import train_on_cluster
 from rtd3jax.study.execute import Work, train_here
+from rtd3jax.study.hosts import own_shard, own_share, relaunch
 from rtd3jax.study.lock import parse_shard, writer
 from rtd3jax.study.loggers import check_loggers, open_loggers
 from rtd3jax.study.memory import lanes_at_once, memory
@@ -28,6 +30,8 @@ from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.worlds import import_worlds
 from rtd3jax.training.lanes import Job, workers
 from rtd3jax.training.run import check_strategy
+
+_UNFINISHED = ("planned", "running", "interrupted")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -45,6 +49,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         for module in options.imports:
             import_worlds(module)
+        if options.distributed and not jax.distributed.is_initialized():
+            relaunch(arguments)
         if options.device:
             jax.config.update("jax_default_device", given.device(options.device))
         return _run(options)
@@ -82,6 +88,8 @@ def _run(options: argparse.Namespace) -> int:
     episodes = given.count("final_episodes", options.final_episodes)
     strategy = check_strategy(options.strategy)
     check_loggers(options.log)
+    if sum(map(bool, (options.shard, options.distributed, options.cluster))) > 1:
+        raise UserError("--shard, --distributed and --cluster each share out the lanes: choose one")
     jobs = cell_jobs(cells, seeds, strategy)
     if options.dry_run:
         print(plan_text(cells, seeds, jobs, strategy, memory()))
@@ -89,17 +97,27 @@ def _run(options: argparse.Namespace) -> int:
     at_once = lanes_at_once(jobs, strategy, len(workers()), memory())
     interval = given.parse_interval(options.checkpoint_every)
     out = given.out(options)
-    shard = None if options.shard is None else parse_shard(options.shard)
+    shard = _shard(options)
     if options.fresh:
         _set_aside(out)
     directory = RunDirectory(out, cells, seeds, episodes)
-    work = Work(strategy, at_once, interval, quiet=options.quiet)
+    work = Work(strategy, at_once, interval, quiet=options.quiet, page=options.report)
     with writer(directory.path, shard):
-        return _train(directory, _share(jobs, shard), work, options)
+        return _train(directory, _share(jobs, shard, options), work, options)
 
 
-def _share(jobs: list[Job], shard: tuple[int, int] | None) -> list[Job]:
+def _shard(options: argparse.Namespace) -> tuple[int, int] | None:
+    if options.distributed:
+        return own_shard()
+    return None if options.shard is None else parse_shard(options.shard)
+
+
+def _share(
+    jobs: list[Job], shard: tuple[int, int] | None, options: argparse.Namespace
+) -> list[Job]:
     """A shard's lanes: every n-th, so that the shares cost about the same."""
+    if options.distributed:
+        return own_share(jobs)
     return jobs if shard is None else jobs[shard[0] - 1 :: shard[1]]
 
 
@@ -111,12 +129,18 @@ def _train(
     interrupted = 0
     with open_loggers(options.log, directory) as logger:
         try:
-            train_here(directory, jobs, work, complaints, references, logger)
+            if options.cluster:
+                where = options.cluster, options.imports
+                train_on_cluster(directory, jobs, work, complaints, references, logger, *where)
+            else:
+                train_here(directory, jobs, work, complaints, references, logger)
         except KeyboardInterrupt as interrupt:
             interrupted = 143 if isinstance(interrupt, _Terminated) else 130
     directory.derive(references)
     if options.report:
-        refresh_page(directory, complete=not interrupted)
+        # Of several processes the last to end has the rest to do.
+        ended = all(row["status"] not in _UNFINISHED for row in directory.ledger())
+        refresh_page(directory, complete=ended and not interrupted)
     print((directory.path / "summary.md").read_text())
     print(f"results: {directory.path}")
     if interrupted:

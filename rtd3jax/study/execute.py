@@ -22,12 +22,16 @@ class Work:
         at_once: lanes that fit in memory.
         interval: of checkpoints, (seconds, steps); see `rtd3jax.study.options.parse_interval`.
         quiet: no progress bar, no remarks.
+        page: whether the run's page is written.
+        workers: as many as this at most; all that there are by default.
     """
 
     strategy: str
     at_once: int
     interval: tuple[float | None, int | None] = (None, None)
     quiet: bool = False
+    page: bool = True
+    workers: int | None = None
 
 
 def train_here(
@@ -49,16 +53,17 @@ def train_here(
         directory.error_path(*job.owner).unlink(missing_ok=True)
     if work.at_once < len(waiting) and not work.quiet:
         print(f"memory for {work.at_once:,} lanes at once: the others wait for their turn")
-    groups = make_groups(waiting, work.strategy, len(workers()), work.at_once)
+    devices = workers()[: work.workers]
+    groups = make_groups(waiting, work.strategy, len(devices), work.at_once)
     checkpoints = checkpoints_of(directory, work.interval)
-    recorder = Recorder(directory, checkpoints, references, logger, complaints)
+    recorder = Recorder(directory, checkpoints, references, logger, complaints, page=work.page)
     with Progress(groups, label, enabled=not work.quiet) as bar:
 
         def on_chunk(group: Group) -> None:
             bar.update(group)
             recorder.update(group)
 
-        advance_groups(groups, on_chunk, checkpoints)
+        advance_groups(groups, on_chunk, checkpoints, devices)
 
 
 def checkpoints_of(

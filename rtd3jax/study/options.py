@@ -63,6 +63,15 @@ def parser(description: str | None) -> argparse.ArgumentParser:
     work.add_argument(
         "--fresh", action="store_true", help="start over; what was there is kept as DIR.old-N"
     )
+    work.add_argument(
+        "--distributed",
+        action="store_true",
+        help="one of several processes of a job (SLURM, Open MPI, or JAX_COORDINATOR_ADDRESS, "
+        "JAX_NUM_PROCESSES, JAX_PROCESS_ID): trains its devices' lanes",
+    )
+    work.add_argument(
+        "--cluster", metavar="ADDRESS", help="cells as tasks of a Ray cluster: auto, or host:port"
+    )
     work.add_argument("--shard", metavar="I/N", help="this process takes the I-th of N shares")
     work.add_argument(
         "--checkpoint-every",

@@ -30,6 +30,8 @@ class Recorder:
         references: Sequence[Reference] | None,
         logger: Logger | None,
         complaints: list[str],
+        *,
+        page: bool = True,
     ):
         """Without ``references``, tables and page are left to whoever started this process."""
         self._directory = directory
@@ -41,6 +43,7 @@ class Recorder:
         self._there = directory.repair_log()
         self._began = time.perf_counter()
         self._complaints = complaints
+        self._page = page
 
     def update(self, group: Group) -> None:
         """Take note of a chunk that ``group`` has done, of its end, or of its error."""
@@ -64,7 +67,8 @@ class Recorder:
         late = time.perf_counter() - self._derived > EARLY_ANSWERS_SECONDS
         if self._references is not None and late:
             self._directory.derive(self._references)
-            refresh_page(self._directory, complete=False)
+            if self._page:
+                refresh_page(self._directory, complete=False)
             self._derived = time.perf_counter()
 
     def _log(self, group: Group) -> None:

@@ -93,10 +93,11 @@ def workers() -> list[Any]:
 
     On a CPU all workers share JAX's one device. Their programs are compiled to run on the calling
     thread alone, so that the cores are shared out by lanes and not within a product; a second
-    device would only compile everything a second time.
+    device would only compile everything a second time. Where XLA was told to show several CPU
+    devices, each of them has a worker.
     """
     first = _default_device()
-    if first.platform == "cpu":
+    if first.platform == "cpu" and len(jax.local_devices(backend="cpu")) == 1:
         return [first] * len(os.sched_getaffinity(0))
     return jax.local_devices(backend=first.platform)
 
@@ -134,17 +135,19 @@ def advance_groups(
     groups: Sequence[Group],
     on_chunk: Callable[[Group], None],
     checkpoints: Checkpoints | None = None,
+    devices: Sequence[Any] | None = None,
 ) -> None:
     """Advance every group to its end, calling ``on_chunk`` in this thread after each chunk.
 
     A group that raises keeps its error and does not touch the others. An interrupt stops the
     workers after their current chunks and is raised again. With ``checkpoints``, groups go on from
-    where theirs were, write them as they go, and once more when they are interrupted.
+    where theirs were, write them as they go, and once more when they are interrupted. ``devices``
+    has one for each worker, `workers` by default.
     """
     pool = _Pool(groups)
     threads = [
         threading.Thread(target=_work, args=(pool, device, checkpoints), daemon=True)
-        for device in workers()[: max(1, len(groups))]
+        for device in (workers() if devices is None else devices)[: max(1, len(groups))]
     ]
     for thread in threads:
         thread.start()

@@ -1,0 +1,342 @@
+"""The cells of a sweep as tasks of a Ray cluster.
+
+Ray schedules, watches over its nodes and starts a task again when its worker or node dies; the run
+directory on shared storage holds what is done, so that a task that is started again goes on from
+its lanes' checkpoints. The driver holds the directory's lock, watches, and makes the tables.
+"""
+
+import contextlib
+import dataclasses
+import importlib
+import json
+import math
+import os
+import platform
+import time
+import uuid
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from rtd3jax.errors import UserError
+from rtd3jax.study.execute import Work, train_here
+from rtd3jax.study.loggers import Logger
+from rtd3jax.study.memory import job_bytes
+from rtd3jax.study.plan import Cell, cell_jobs, label
+from rtd3jax.study.report.page import refresh_page
+from rtd3jax.study.results import CELL
+from rtd3jax.study.rundir import LOG, Reference, RunDirectory, cell_name, read_log
+from rtd3jax.study.worlds import import_worlds
+from rtd3jax.training.checkpoint import checkpoint_steps
+from rtd3jax.training.lanes import Job
+from rtd3jax.versions import versions_of
+
+PACKAGES = ("rtd3jax", "jax", "jaxlib", "flax", "optax", "gymnax", "numpy")
+TASKS = "cluster.jsonl"
+"""A line per task that ended: its cell, where and when it ran, and from which steps it went on."""
+_POLL_SECONDS = 0.1
+_PROCESS_BYTES = 700 * 2**20
+"""Of a worker before it has a lane: Python, JAX and its compiled programs."""
+_EARLY_ANSWERS_SECONDS = 60.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Need:
+    """What a task asks of its node; ``memory`` in bytes."""
+
+    cpus: int
+    gpus: int
+    memory: int
+
+
+def train_on_cluster(
+    directory: RunDirectory,
+    jobs: Sequence[Job],
+    work: Work,
+    complaints: list[str],
+    references: Sequence[Reference],
+    logger: Logger | None,
+    address: str,
+    imports: Sequence[str],
+) -> None:
+    """Train the lanes that are not done, a Ray task for each cell.
+
+    Args:
+        directory: the run, on storage that every node sees under the same path.
+        jobs: all lanes of the run.
+        work: how they are trained; ``at_once`` is for each task to find.
+        complaints: gains a line for each lane or cell that fails.
+        references: for the tables that are made meanwhile.
+        logger: of trackers, fed by this process.
+        address: ``auto``, or of the cluster.
+        imports: modules that register worlds.
+
+    Raises:
+        UserError: when there is no cluster, its nodes cannot do the work, or Ray is not installed.
+    """
+    waiting: dict[Cell, list[Job]] = {}
+    for job in jobs:
+        if not directory.is_done(*job.owner):
+            waiting.setdefault(job.owner[0], []).append(job)
+    lanes = sum(map(len, waiting.values()))
+    if lanes < len(jobs):
+        print(f"{len(jobs) - lanes} of {len(jobs)} lanes are there already")
+    if not waiting:
+        return
+    ray = _ray()
+    with _connected(ray, address):
+        nodes = [node for node in ray.nodes() if node["Alive"]]
+        needs = {cell: _need(members, work, nodes) for cell, members in waiting.items()}
+        _check_nodes(ray, nodes, directory, imports)
+        task = ray.remote(_train_cell)
+        pending = {}
+        for cell, members in waiting.items():
+            seeds, need = [job.owner[1] for job in members], needs[cell]
+            options = {
+                "num_cpus": need.cpus,
+                "num_gpus": need.gpus,
+                "memory": need.memory,
+                "max_retries": -1,  # of workers and nodes that die; what raises is not tried again
+                "name": label(members[0]),
+            }
+            path = str(directory.path.resolve())
+            index = directory.cells.index(cell)
+            arguments = (path, index, seeds, dataclasses.replace(work, quiet=True), need.cpus)
+            pending[task.options(**options).remote(*arguments, list(imports))] = members
+        log = _Log(directory, logger)
+        _watch(ray, directory, pending, complaints, references, log, work)
+
+
+def _ray() -> Any:
+    try:
+        return importlib.import_module("ray")
+    except ImportError as error:
+        raise UserError("--cluster needs Ray: pip install 'rtd3jax[ray]'") from error
+
+
+@contextlib.contextmanager
+def _connected(ray: Any, address: str) -> Iterator[None]:
+    # A task may use fewer GPUs than its node has: Ray hides the others, and shall not hide all
+    # from a task that asks for none.
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    try:
+        ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+    except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise UserError(
+            f"--cluster {address}: there is no Ray cluster ({reason}); start one with "
+            "ray start --head"
+        ) from error
+    try:
+        yield
+    finally:
+        ray.shutdown()
+
+
+def _need(members: Sequence[Job], work: Work, nodes: Sequence[dict]) -> Need:
+    """The lanes of a cell side by side, on as many cores as the largest node has for them.
+
+    Raises:
+        UserError: for a cell that no node can hold.
+    """
+    most = {
+        name: max((node["Resources"].get(name, 0) for node in nodes), default=0)
+        for name in ("CPU", "GPU", "memory")
+    }
+    state, working = job_bytes(members[:1]).popitem()[1]
+    gpus = 1 if work.strategy == "vmap" else 0
+    cpus = min(len(members), int(most["CPU"])) if work.strategy == "map" else 1
+    # Under `map` finished chunks leave states behind for all lanes, and work on some.
+    memory = math.ceil(_PROCESS_BYTES + len(members) * state + max(cpus, 1) * working)
+    need = Need(cpus, gpus, memory)
+    asked = {"CPU": max(need.cpus, 1), "GPU": need.gpus, "memory": need.memory}
+    for name, amount in asked.items():
+        if amount > most[name]:
+            scale, unit = (2**20, " MiB") if name == "memory" else (1, "")
+            raise UserError(
+                f"--cluster: {label(members[0])} needs {amount / scale:,.0f}{unit} {name}, the "
+                f"largest node has {most[name] / scale:,.0f}{unit}"
+            )
+    return need
+
+
+def _check_nodes(
+    ray: Any, nodes: Sequence[dict], directory: RunDirectory, imports: Sequence[str]
+) -> None:
+    """Ask every node for its versions, and whether it sees the run directory.
+
+    Raises:
+        UserError: naming the node and what is wrong there.
+    """
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    mine = versions_of(PACKAGES)
+    token = uuid.uuid4().hex
+    mark = directory.path / f".cluster-{token}"
+    mark.write_text(token)
+    try:
+        probe = ray.remote(_probe)
+        asked = {}
+        for node in nodes:
+            where = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
+            options = {"num_cpus": 0, "scheduling_strategy": where, "max_retries": 0}
+            answer = probe.options(**options).remote(str(mark.resolve()), list(imports))
+            asked[answer] = node["NodeManagerAddress"]
+        for answer, name in asked.items():
+            try:
+                versions, seen, problem = ray.get(answer, timeout=300)
+            except Exception as error:
+                reason = str(error).strip().splitlines()[-1]
+                raise UserError(f"--cluster: node {name} cannot work: {reason}") from error
+            if problem:
+                raise UserError(f"--cluster: node {name}: {problem}")
+            for package, version in mine.items():
+                if versions.get(package) != version:
+                    raise UserError(
+                        f"--cluster: node {name} has {package} {versions.get(package)}, here it "
+                        f"is {version}; install the same versions"
+                    )
+            if seen != token:
+                raise UserError(
+                    f"--cluster: node {name} does not see {directory.path.resolve()}; --out must "
+                    "be on storage that all nodes share, under the same path"
+                )
+    finally:
+        mark.unlink(missing_ok=True)
+
+
+def _probe(mark: str, imports: list[str]) -> tuple[dict[str, str], str | None, str | None]:
+    """On a node: its versions, what it reads at ``mark``, and what else is wrong."""
+    problem = None
+    try:
+        for module in imports:
+            import_worlds(module)
+    except UserError as error:
+        problem = str(error)
+    path = Path(mark)
+    return versions_of(PACKAGES), path.read_text() if path.exists() else None, problem
+
+
+def _train_cell(
+    path: str, index: int, seeds: list[int], work: Work, cpus: int, imports: list[str]
+) -> tuple[list[str], dict[str, Any]]:
+    """On a node: train the lanes of a cell that are not done; complaints, and a line of `TASKS`."""
+    began = time.time()
+    for module in imports:
+        import_worlds(module)
+    directory = RunDirectory.open(path)
+    cell = directory.cells[index]
+    # All cells, because side by side they share a program as wide as the longest window.
+    jobs = cell_jobs(directory.cells, directory.seeds, work.strategy)
+    own = [job for job in jobs if job.owner[0] == cell and job.owner[1] in seeds]
+    complaints: list[str] = []
+    kept = [checkpoint_steps(directory.checkpoint_directory(cell, seed)) for seed in seeds]
+    training = time.time()
+    train_here(directory, own, dataclasses.replace(work, workers=cpus or None), complaints)
+    report = {
+        "cell": cell_name(cell),
+        "seeds": seeds,
+        "from_steps": [max(steps, default=0) for steps in kept],
+        "node": platform.node(),
+        "process": os.getpid(),
+        "began": began,
+        "training": training,
+        "ended": time.time(),
+    }
+    return complaints, report
+
+
+def _watch(
+    ray: Any,
+    directory: RunDirectory,
+    pending: dict[Any, list[Job]],
+    complaints: list[str],
+    references: Sequence[Reference],
+    log: "_Log",
+    work: Work,
+) -> None:
+    """Wait for the tasks; on Ctrl-C they are told to write their checkpoints."""
+    cells, derived = len(pending), time.perf_counter()
+    try:
+        with _bar(work.quiet) as bar:
+            everything = sum(cell.config.total_steps for cell in directory.cells)
+            line = bar.add_task("", total=everything * len(directory.seeds), cells="")
+            while pending:
+                done, _ = ray.wait(list(pending), timeout=_POLL_SECONDS)
+                for task in done:
+                    jobs = pending.pop(task)
+                    complaints += _outcome(ray, task, directory, jobs)
+                words = f"{cells - len(pending)} of {cells} cells"
+                bar.update(line, completed=log.steps(), cells=words)
+                if done and time.perf_counter() - derived > _EARLY_ANSWERS_SECONDS:
+                    directory.derive(references)
+                    if work.page:
+                        refresh_page(directory, complete=False)
+                    derived = time.perf_counter()
+    except KeyboardInterrupt:
+        for task in pending:
+            ray.cancel(task, force=False)
+        ray.wait(list(pending), num_returns=len(pending), timeout=60)
+        raise
+
+
+def _bar(quiet: bool) -> Progress:
+    return Progress(
+        TextColumn("{task.percentage:3.0f}%"),
+        BarColumn(bar_width=24),
+        TextColumn("{task.fields[cells]}"),
+        TimeElapsedColumn(),
+        console=Console(stderr=True),
+        disable=quiet,
+    )
+
+
+def _outcome(ray: Any, task: Any, directory: RunDirectory, jobs: Sequence[Job]) -> list[str]:
+    """Complaints of a task that ended; one that died leaves its reason with its lanes."""
+    try:
+        complaints, report = ray.get(task)
+        with (directory.path / TASKS).open("a") as file:
+            file.write(json.dumps(report) + "\n")
+        return complaints
+    except Exception as error:
+        reason = str(error).strip().splitlines()[-1]
+        for job in jobs:
+            cell, seed = job.owner
+            if not directory.is_done(cell, seed):
+                directory.write_error(cell, seed, reason)
+        return [f"{label(jobs[0])} failed: {reason}"]
+
+
+class _Log:
+    """The log that the tasks write, as it grows: steps done, and rows for the trackers."""
+
+    def __init__(self, directory: RunDirectory, logger: Logger | None) -> None:
+        self._path = directory.path / LOG
+        self._cells = {tuple(cell.key.values()): cell for cell in directory.cells}
+        self._logger = logger
+        self._steps: dict[tuple, int] = {}
+        self._read = len(read_log(self._path))
+        self._reach(read_log(self._path))
+
+    def steps(self) -> int:
+        """Steps up to each lane's last evaluation, by now."""
+        rows = read_log(self._path)[self._read :]
+        self._read += len(rows)
+        self._reach(rows)
+        for row in rows if self._logger is not None else ():
+            assert self._logger is not None
+            self._logger.log(self._cells[_key(row)], row["seed"], row)
+        return sum(self._steps.values())
+
+    def _reach(self, rows: Sequence[dict[str, Any]]) -> None:
+        for row in rows:
+            lane = (*_key(row), row["seed"])
+            if lane[:-1] in self._cells:
+                self._steps[lane] = max(self._steps.get(lane, 0), row["step"])
+
+
+def _key(row: dict[str, Any]) -> tuple[Any, ...]:
+    return tuple(row[name] for name in CELL)

@@ -1,0 +1,45 @@
+"""Joins a job of several processes, then runs the sweep: ``python launch.py SWEEP-ARGUMENTS``.
+
+A process may join only before JAX has touched a device, and importing gymnax touches one; so this
+file is run by its path, in a process of its own, and imports the package last.
+`rtd3jax.study.hosts` starts it.
+"""
+
+import os
+import sys
+
+import jax
+
+FOREVER = 10 * 365 * 24 * 3600
+"""Seconds for which a process that is done waits for the others before it leaves the job."""
+
+
+def number(name: str) -> int | None:
+    """An environment variable as a number, if it is there."""
+    return int(os.environ[name]) if os.environ.get(name) else None
+
+
+def main() -> int:
+    """Join, sweep, leave; the sweep's exit status."""
+    try:
+        jax.distributed.initialize(
+            num_processes=number("JAX_NUM_PROCESSES"),
+            process_id=number("JAX_PROCESS_ID"),
+            shutdown_timeout_seconds=FOREVER,
+        )
+    except (ValueError, TypeError, RuntimeError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        print(
+            f"error: --distributed: {reason} Start the processes with srun or mpirun, or set "
+            "JAX_COORDINATOR_ADDRESS (host:port of the first), JAX_NUM_PROCESSES and "
+            "JAX_PROCESS_ID (0, 1, ...) for each",
+            file=sys.stderr,
+        )
+        return 2
+    from rtd3jax import sweep
+
+    return sweep.main(sys.argv[1:])
+
+
+if __name__ == "__main__":
+    sys.exit(main())
