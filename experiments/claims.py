@@ -6,8 +6,9 @@ An effect is a difference of means over seeds with a 95% bootstrap interval (see
 each side, 10,000 times, fixed random numbers). *Supported* means that the interval lies on the
 claim's side of zero, *contradicted* that it lies on the other, *undecided* that it has zero in it
 or that there are fewer than three seeds on a side. A claim of several comparisons is as its worst
-one; a claim of no effect is supported where the interval lies within a margin that is stated.
-Writes claims.md and .parquet.
+one; a claim of no effect is supported where the interval lies within 0.05 of a normalised return,
+and contradicted where it lies beyond. Rover: returns. Pendulum: normalised returns. Iteration time:
+rounds of the benchmark in place of seeds. Writes claims.md and .parquet.
 """
 
 import argparse
@@ -25,6 +26,10 @@ sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
 
 FEWEST_SEEDS = 3
+MARGIN = 0.05
+PARTIAL = ("temporal-sine", "random-sine", "noise", "hidden")
+HARD_NOISE = "noise:sigma=1.0"
+BIAS = "temporal-bias:amplitude_min=1.0,amplitude_max=1.0"
 RESAMPLES = 10_000
 LSTM_AGENTS = [a for a in rtd.ALGORITHMS if a.startswith("lstm")]
 BEST = "lstm-td3-1ha1hc"
@@ -71,49 +76,223 @@ def combine(verdicts: list[str]) -> str:
     return SUPPORTED if verdicts and set(verdicts) == {SUPPORTED} else UNDECIDED
 
 
-class Rover:
-    """The rover's results: a row per policy and process."""
+@dataclasses.dataclass(frozen=True)
+class Equal(Effect):
+    """A difference that a claim says is none: within `MARGIN` of a normalised return."""
 
-    def __init__(self, table: pd.DataFrame | None):
-        self._table = table
+    def verdict(self) -> str:
+        """Supported where the interval lies within the margin, contradicted where outside it."""
+        if min(len(self.better), len(self.worse)) < FEWEST_SEEDS:
+            return UNDECIDED
+        _, low, high = self.interval()
+        if low >= -MARGIN and high <= MARGIN:
+            return SUPPORTED
+        return CONTRADICTED if low > MARGIN or high < -MARGIN else UNDECIDED
 
-    def values(self, algorithm: str, trained: str, tested: str = "ar1-slip") -> np.ndarray:
+
+@dataclasses.dataclass(frozen=True)
+class Results:
+    """All that there is: tables of the experiments, empty ones where they were not run."""
+
+    rover: pd.DataFrame
+    pendulum: pd.DataFrame
+    generalisation: pd.DataFrame
+    bench: pd.DataFrame
+
+    @classmethod
+    def read(cls, directory: pathlib.Path) -> "Results":
+        """From the directory of results."""
+        files = [directory / f"{name}.parquet" for name in ("rover", "pendulum", "generalisation")]
+        tables = [pd.read_parquet(file) if file.exists() else pd.DataFrame() for file in files]
+        bench = directory / "benchmarks" / "measurements.csv"
+        return cls(*tables, pd.read_csv(bench) if bench.exists() else pd.DataFrame())
+
+    def on_rover(self, algorithm: str, trained: str, tested: str = "ar1-slip") -> np.ndarray:
         """Mean return of each seed."""
-        if self._table is None:
-            return np.empty(0)
-        t = self._table
-        rows = (t["algorithm"] == algorithm) & (t["trained_on"] == trained)
-        return t[rows & (t["tested_on"] == tested)].sort_values("seed")["mean"].to_numpy()
+        key = {"algorithm": algorithm, "trained_on": trained, "tested_on": tested}
+        return _by_seed(self.rover, key, "mean")
+
+    def on_pendulum(
+        self, algorithm: str, disturbance: str, length: int | None = None
+    ) -> np.ndarray:
+        """Normalised return of each seed: of one window length, or the mean over those run."""
+        key: dict = {"algorithm": algorithm, "disturbance": disturbance}
+        if length is not None and algorithm != "td3":
+            key["history_length"] = length
+        return _by_seed(self.pendulum, key, "normalised")
+
+    def lengths(self) -> list[int]:
+        """Window lengths run on the pendulum."""
+        if self.pendulum.empty:
+            return []
+        found = self.pendulum["history_length"]
+        return sorted(int(length) for length in found[found > 0].unique())
+
+    def carried(self, algorithm: str, tested: str) -> np.ndarray:
+        """Normalised return of each seed of an agent of `random-sine` under another condition."""
+        key = {"algorithm": algorithm, "tested_on": tested}
+        return _by_seed(self.generalisation, key, "normalised")
+
+    def rates(self, algorithm: str, length: int) -> np.ndarray:
+        """Seed-steps per second in each round of the benchmark."""
+        key = {"agent": algorithm, "history_length": length, "measurement": "rtd3jax float32"}
+        return _rows(self.bench, key)["value"].to_numpy() if len(self.bench) else np.empty(0)
 
 
-def agents_beat_td3(rover: Rover) -> list[Effect]:
+def _rows(table: pd.DataFrame, key: dict) -> pd.DataFrame:
+    return table[(table[list(key)] == list(key.values())).all(axis=1)]
+
+
+def _by_seed(table: pd.DataFrame, key: dict, column: str) -> np.ndarray:
+    if table.empty:
+        return np.empty(0)
+    return _rows(table, key).groupby("seed")[column].mean().to_numpy()
+
+
+def history_is_nothing(disturbance: str) -> Callable[[Results], list[Effect]]:
+    """Claims 1 and 2."""
+    return lambda results: [
+        Equal(
+            "lstm-td3 over lstm-td3-no-action",
+            results.on_pendulum("lstm-td3", disturbance),
+            results.on_pendulum("lstm-td3-no-action", disturbance),
+        )
+    ]
+
+
+def history_helps(results: Results, disturbance: str) -> list[Effect]:
+    """Action history helps."""
+    with_it, without = (
+        results.on_pendulum(agent, disturbance) for agent in ("lstm-td3", "lstm-td3-no-action")
+    )
+    return [Effect("lstm-td3 over lstm-td3-no-action", with_it, without)]
+
+
+def length_helps(results: Results, disturbance: str) -> list[Effect]:
+    """The longest window over the shortest."""
+    lengths = results.lengths()
+    if len(lengths) < 2:
+        return []
+    long, short = (results.on_pendulum("lstm-td3", disturbance, lengths[k]) for k in (-1, 0))
+    return [Effect(f"lstm-td3, l={lengths[-1]} over l={lengths[0]}", long, short)]
+
+
+def temporal_sine(results: Results) -> list[Effect]:
+    """Claim 3."""
+    return history_helps(results, "temporal-sine") + length_helps(results, "temporal-sine")
+
+
+def noise(results: Results) -> list[Effect]:
+    """Claim 5; that returns sag late in training is left to the curves."""
+    found = history_helps(results, "noise") + length_helps(results, "noise")
+    small, large = (results.on_pendulum("lstm-td3", name) for name in ("noise", HARD_NOISE))
+    return [*found, Effect("lstm-td3, sigma 0.5 over 1.0", small, large)]
+
+
+def hidden(results: Results) -> list[Effect]:
+    """Claim 6."""
+    found = history_is_nothing("hidden")(results)
+    return found + [Equal(e.name, e.better, e.worse) for e in length_helps(results, "hidden")]
+
+
+def memory_helps(results: Results) -> list[Effect]:
+    """Claim 7."""
+    return [
+        Effect(
+            f"{disturbance}: {agent} over td3",
+            results.on_pendulum(agent, disturbance),
+            results.on_pendulum("td3", disturbance),
+        )
+        for disturbance in PARTIAL
+        for agent in LSTM_AGENTS
+    ]
+
+
+def one_stream(results: Results) -> list[Effect]:
+    """Claim 8: on average over the disturbances."""
+
+    def overall(agent: str) -> np.ndarray:
+        found = [results.on_pendulum(agent, disturbance) for disturbance in PARTIAL]
+        return np.mean(found, axis=0) if len({len(v) for v in found}) == 1 else np.empty(0)
+
+    others = [agent for agent in rtd.ALGORITHMS if agent != BEST]
+    return [Effect(f"{BEST} over {agent}", overall(BEST), overall(agent)) for agent in others]
+
+
+def stored_carries(results: Results) -> list[Effect]:
+    """Claim 9."""
+    return [
+        (Effect if disturbance == "noise" else Equal)(
+            f"{disturbance}: lstm-td3 over h-td3",
+            results.on_pendulum("lstm-td3", disturbance),
+            results.on_pendulum("h-td3", disturbance),
+        )
+        for disturbance in PARTIAL
+    ]
+
+
+def iteration_time(results: Results) -> list[Effect]:
+    """Claim 10: steps a second at every length, and what a long window leaves of them."""
+    found, lengths = [], (1, 3, 6, 10, 20)
+    for agent in LSTM_AGENTS:
+        found += [
+            Effect(f"l={n}: h-td3 over {agent}", results.rates("h-td3", n), results.rates(agent, n))
+            for n in lengths
+            if len(results.rates(agent, n)) and len(results.rates("h-td3", n))
+        ]
+        kept = [
+            results.rates(name, 20) / results.rates(name, 1)
+            if len(results.rates(name, 20)) == len(results.rates(name, 1))
+            else np.empty(0)
+            for name in ("h-td3", agent)
+        ]
+        found.append(Effect(f"share of the rate kept at l=20: h-td3 over {agent}", *kept))
+    return found
+
+
+def carries_over(results: Results) -> list[Effect]:
+    """Claim 11: each of the three conditions over noise."""
+    return [
+        Effect(
+            f"{agent}: {condition.partition(':')[0]} over noise",
+            results.carried(agent, condition),
+            results.carried(agent, HARD_NOISE),
+        )
+        for agent in LSTM_AGENTS
+        for condition in ("combined-sine", "damped-sine", BIAS)
+    ]
+
+
+def agents_beat_td3(results: Results) -> list[Effect]:
     """Claim 12."""
-    td3 = rover.values("td3", "ar1-slip")
-    return [Effect(f"{a} over td3", rover.values(a, "ar1-slip"), td3) for a in LSTM_AGENTS]
+    td3 = results.on_rover("td3", "ar1-slip")
+    return [Effect(f"{a} over td3", results.on_rover(a, "ar1-slip"), td3) for a in LSTM_AGENTS]
 
 
-def sine_over_none(rover: Rover) -> list[Effect]:
+def sine_over_none(results: Results) -> list[Effect]:
     """Claim 13."""
     return [
-        Effect(f"{a}, sine over none", rover.values(a, "sine-slip"), rover.values(a, "none"))
+        Effect(
+            f"{a}, sine over none", results.on_rover(a, "sine-slip"), results.on_rover(a, "none")
+        )
         for a in rtd.ALGORITHMS
         if a != "td3"
     ]
 
 
-def best_transfer(rover: Rover) -> list[Effect]:
+def best_transfer(results: Results) -> list[Effect]:
     """Claim 14."""
-    best = rover.values(BEST, "sine-slip")
+    best = results.on_rover(BEST, "sine-slip")
     others = [a for a in rtd.ALGORITHMS if a != BEST]
-    return [Effect(f"{BEST} over {a}", best, rover.values(a, "sine-slip")) for a in others]
+    return [Effect(f"{BEST} over {a}", best, results.on_rover(a, "sine-slip")) for a in others]
 
 
-def slip_variants(rover: Rover) -> list[Effect]:
+def slip_variants(results: Results) -> list[Effect]:
     """Claim 15: of the three variants high variance is the worst and fast slip the best."""
     effects = []
     for a in rtd.ALGORITHMS:
         high, fast, slow = (
-            rover.values(a, "sine-slip", f"ar1-slip-{kind}")
+            results.on_rover(a, "sine-slip", f"ar1-slip-{kind}")
             for kind in ("high-variance", "fast", "slow")
         )
         effects += [
@@ -123,18 +302,22 @@ def slip_variants(rover: Rover) -> list[Effect]:
     return effects
 
 
-CLAIMS: tuple[tuple[int, str, Callable[[Rover], list[Effect]] | None], ...] = (
-    (1, "fully observable: action history changes nothing", None),
-    (2, "`temporal-bias`: action history makes no clear difference", None),
-    (3, "`temporal-sine`: longer windows and action history help", None),
-    (4, "`random-sine`: action history helps", None),
-    (5, "`noise`: action history helps, a larger sigma hurts, longer windows help", None),
-    (6, "`hidden`: the final return depends on neither", None),
-    (7, "every LSTM agent beats `td3` under partial observability", None),
-    (8, "one stream beats two; `lstm-td3-1ha1hc` is the most robust", None),
-    (9, "`h-td3` matches `lstm-td3` except under `noise`", None),
-    (10, "`h-td3` has the shortest iteration", None),
-    (11, "agents trained on `random-sine` carry over, except to `noise`", None),
+CLAIMS: tuple[tuple[int, str, Callable[[Results], list[Effect]]], ...] = (
+    (1, "fully observable: action history changes nothing", history_is_nothing("none")),
+    (
+        2,
+        "`temporal-bias`: action history makes no clear difference",
+        history_is_nothing("temporal-bias"),
+    ),
+    (3, "`temporal-sine`: longer windows and action history help", temporal_sine),
+    (4, "`random-sine`: action history helps", lambda r: history_helps(r, "random-sine")),
+    (5, "`noise`: action history helps, a larger sigma hurts, longer windows help", noise),
+    (6, "`hidden`: the final return depends on neither", hidden),
+    (7, "every LSTM agent beats `td3` under partial observability", memory_helps),
+    (8, "one stream beats two; `lstm-td3-1ha1hc` is the most robust", one_stream),
+    (9, "`h-td3` matches `lstm-td3` except under `noise`", stored_carries),
+    (10, "`h-td3` has the shortest iteration, least sensitive to the window", iteration_time),
+    (11, "agents trained on `random-sine` carry over, except to `noise`", carries_over),
     (12, "rover on AR(1) slip: every LSTM agent beats `td3`", agents_beat_td3),
     (13, "training on sine slip transfers better than training without slip", sine_over_none),
     (14, "`lstm-td3-1ha1hc` transfers best from sine to AR(1) slip", best_transfer),
@@ -142,11 +325,11 @@ CLAIMS: tuple[tuple[int, str, Callable[[Rover], list[Effect]] | None], ...] = (
 )
 
 
-def judge(rover: Rover) -> pd.DataFrame:
+def judge(results: Results) -> pd.DataFrame:
     """A row per claim: number, claim, verdict, effects."""
     rows = []
     for number, claim, effects_of in CLAIMS:
-        effects = [] if effects_of is None else effects_of(rover)
+        effects = effects_of(results)
         there = [effect for effect in effects if len(effect.better) and len(effect.worse)]
         rows.append(
             {
@@ -164,10 +347,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--results", type=pathlib.Path, default=RESULTS)
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
     options = parser.parse_args(arguments)
-    file = options.results / "rover.parquet"
-    table = judge(Rover(pd.read_parquet(file) if file.exists() else None))
+    table = judge(Results.read(options.results))
     text = markdown_table(
-        ["", "the paper's claim", "verdict", "effect: difference of mean returns [95% interval]"],
+        ["", "the paper's claim", "verdict", "effect: difference of means [95% interval]"],
         [[str(row.claim), row.text, row.verdict, row.effects] for row in table.itertuples()],
     )
     write_results(options.out, "claims", table, text, provenance(resamples=RESAMPLES))

@@ -102,7 +102,7 @@ def main(arguments=None):
         os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
         assert sweep(root / "local", more).wait() == 0
         expected = contents(root / "local")
-        with cluster() as (ray_cluster, nodes):
+        with cluster(1 if options.quick else 3) as (ray_cluster, nodes):
             address = ray_cluster.address
             out = root / "cluster"
             status = sweep(out, more, address).wait()

@@ -3,13 +3,12 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from rtd3jax.envs.registry import make, parse_disturbance
 from rtd3jax.errors import UserError
-from rtd3jax.evaluate import evaluate
 from rtd3jax.files import write_bytes_atomically
+from rtd3jax.study.references import both_returns
 from rtd3jax.study.report.transfer import COLUMNS, FILE
 from rtd3jax.study.rundir import RunDirectory
 
@@ -19,14 +18,17 @@ def transfer(
     tested_on: Sequence[str] | None,
     episodes: int,
     say: Callable[[str], None] = print,
+    *,
+    write: bool = True,
 ) -> pd.DataFrame:
-    """Test every trained policy of ``directory`` and keep the returns in ``transfer.parquet``.
+    """Test every trained policy of ``directory``; returns go to ``transfer.parquet``.
 
     Args:
         directory: the run.
         tested_on: disturbances; by default those of the run, for each environment its own.
         episodes: for each policy and disturbance. A lane's seed is also that of its episodes, so
             that agents of one seed meet the same ones.
+        write: whether to keep the table in the run directory.
         say: takes a line where a disturbance does not suit some policies.
 
     Raises:
@@ -47,7 +49,7 @@ def transfer(
                     if not directory.is_done(cell, seed):
                         continue
                     policy = directory.policy(cell, seed)
-                    returns = evaluate(policy, worlds[world], episodes, seed)
+                    both = both_returns(policy, worlds[world], episodes, seed)
                 except UserError as error:
                     problems.setdefault((cell.disturbance, disturbance, str(error)), []).append(
                         seed
@@ -63,8 +65,9 @@ def transfer(
                         "seed": seed,
                         "episode": episode,
                         "return": float(value),
+                        "true_return": float(true),
                     }
-                    for episode, value in enumerate(np.asarray(returns))
+                    for episode, (value, true) in enumerate(zip(*both, strict=True))
                 ]
     for (trained_on, tested, reason), seeds in problems.items():
         say(f"not tested on {tested}: {len(seeds)} agents trained on {trained_on}: {reason}")
@@ -72,6 +75,7 @@ def transfer(
         raise UserError(
             f"nothing in {directory.path} could be tested: --status tells what there is"
         )
-    table = pd.DataFrame(rows, columns=list(COLUMNS))
-    write_bytes_atomically(directory.path / FILE, table.to_parquet(index=False))
+    table = pd.DataFrame(rows, columns=[*COLUMNS, "true_return"])
+    if write:
+        write_bytes_atomically(directory.path / FILE, table.to_parquet(index=False))
     return table

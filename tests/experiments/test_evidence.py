@@ -7,13 +7,13 @@ import pandas as pd
 import pytest
 from test_reliability import EXPERIMENTS, load
 
-from rtd3jax import sweep
+from rtd3jax.study import references
 
 
 @pytest.fixture(autouse=True)
 def leave_the_path_alone(monkeypatch):
     monkeypatch.setattr(sys, "path", list(sys.path))
-    monkeypatch.setattr(sweep, "REFERENCE_EPISODES", 2)
+    monkeypatch.setattr(references, "EPISODES", 2)
 
 
 def test_the_rover_experiment_runs_and_says_what_is_missing(tmp_path, capsys):
@@ -34,7 +34,7 @@ def test_the_rover_experiment_runs_and_says_what_is_missing(tmp_path, capsys):
     assert (out / "rover_drive.gif").read_bytes().startswith(b"GIF")
 
 
-@pytest.mark.parametrize("name", ["slip_distributions", "parameter_counts"])
+@pytest.mark.parametrize("name", ["slip_distributions", "parameter_counts", "sizing"])
 def test_small_experiments_run(name, tmp_path):
     load(EXPERIMENTS / f"{name}.py").main(["--quick", "--out", str(tmp_path)])
     assert (tmp_path / f"{name}.md").exists() and (tmp_path / f"{name}.parquet").exists()
@@ -68,3 +68,56 @@ def test_claims_without_results_are_undecided(tmp_path, capsys):
     table = pd.read_parquet(tmp_path / "claims.parquet")
     assert len(table) == 15 and set(table["verdict"]) == {"undecided"}
     assert capsys.readouterr().out.count("not run yet") == 15
+
+
+def test_a_claim_of_no_effect_needs_a_narrow_interval():
+    claims = load(EXPERIMENTS / "claims.py")
+    one = np.array([0.90, 0.91, 0.92])
+    assert claims.Equal("", one, one + 0.01).verdict() == "supported"
+    assert claims.Equal("", one, one + 0.2).verdict() == "contradicted"
+    assert claims.Equal("", one, np.array([0.6, 0.9, 1.2])).verdict() == "undecided"
+    assert claims.Equal("", one[:2], one).verdict() == "undecided"
+
+
+def test_the_pendulums_claims_follow_from_its_tables(tmp_path):
+    claims = load(EXPERIMENTS / "claims.py")
+    level = {"td3": 0.2, "lstm-td3": 0.6, "lstm-td3-no-action": 0.5, "lstm-td3-1ha1hc": 0.8}
+    level |= {"lstm-td3-1ha2hc": 0.7, "h-td3": 0.6}
+    chance = np.random.default_rng(0)
+    lanes = [
+        {
+            "algorithm": agent,
+            "disturbance": disturbance,
+            "history_length": length,
+            "seed": seed,
+            "normalised": value + chance.normal(0, 0.002) + 0.01 * (length or 0),
+        }
+        for agent, value in level.items()
+        for disturbance in ("temporal-sine", "random-sine", "noise", "hidden")
+        for length in ((0,) if agent == "td3" else (1, 6))
+        for seed in range(5)
+    ]
+    pd.DataFrame(lanes).to_parquet(tmp_path / "pendulum.parquet")
+    claims.main(["--results", str(tmp_path), "--out", str(tmp_path)])
+    verdicts = pd.read_parquet(tmp_path / "claims.parquet").set_index("claim")["verdict"]
+    assert list(verdicts[[3, 4, 7, 8]]) == ["supported"] * 4
+    # With and without action history are 0.1 apart, more than the margin.
+    assert verdicts[6] == "contradicted"
+    # h-td3 matches lstm-td3, under noise too: half the claim fails.
+    assert verdicts[9] in ("undecided", "contradicted")
+    assert set(verdicts[[1, 2, 10, 11, 12]]) == {"undecided"}
+
+
+def test_the_pendulum_experiment_runs(tmp_path, capsys, monkeypatch):
+    pendulum = load(EXPERIMENTS / "pendulum.py")
+    best = pendulum.rtd.Ceiling(-136.0, 0.5, "exact")
+    monkeypatch.setattr(pendulum.rtd, "ceiling", lambda env: best)
+    monkeypatch.setattr(pendulum, "REFERENCE_EPISODES", 2)
+    monkeypatch.setattr(pendulum, "CONDITIONS", ("random-sine",))
+    run, out = tmp_path / "run", tmp_path / "out"
+    assert pendulum.main(["--quick", "--run", str(run), "--out", str(out)]) == 0
+    table = pd.read_parquet(out / "pendulum.parquet")
+    assert len(table) == 1 and np.isfinite(table["normalised"]).all()
+    assert len(pd.read_parquet(out / "generalisation.parquet")) == 1
+    assert (out / "pendulum.png").stat().st_size > 5_000
+    assert "not run" in capsys.readouterr().out
