@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: help venv sweep bench lint format test clean
+.PHONY: help venv sweep bench docs lint format test clean
 
 help:  ## these lines
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/:/'
@@ -21,6 +21,10 @@ bench: venv  ## how fast it is here, beside PyTorch: 20 minutes; the same comman
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]' \
 		|| echo "PyTorch cannot be installed here"
 	$(BIN)/python -m experiments.benchmarks.bench $(ARGS)
+
+docs: venv  ## the API reference, from the docstrings: build/api/index.html
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	$(BIN)/pdoc rtd3jax --output-directory build/api
 
 lint: venv  ## formatting, lint, types
 	$(BIN)/ruff format --check .

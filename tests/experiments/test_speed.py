@@ -7,8 +7,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.benchmarks import bench, lanes_on_device, report
+import rtd3jax as rtd
+from experiments.benchmarks import bench, lanes_on_device, products, report
 from experiments.benchmarks.torch_processes import ONE_PROCESS, PROCESS_PER_CORE, ROOT
+from rtd3jax.study.plan import update_flops
 from rtd3jax.training import lanes
 
 QUICK = ["--quick", "--no-torch", "--out"]
@@ -163,3 +165,16 @@ def test_the_documentations_counts_are_those_of_the_code(capsys):
     exec(compile(block, "how_it_is_fast.md", "exec"), {})
     shown = [line.removeprefix("# ") for line in block.splitlines() if line.startswith("# ")]
     assert capsys.readouterr().out.splitlines() == shown
+
+
+@pytest.mark.parametrize("length", [1, 6, 20])
+def test_the_products_timed_alone_are_those_that_are_counted(length):
+    config = rtd.Config(products.AGENT, length)
+    listed = products.products_of(length, config.batch_size, config.hidden_size)
+    total = sum(product.count * product.flops for product in listed)
+    assert total == pytest.approx(update_flops(config), rel=1e-9)
+
+
+def test_products_alone_run(tmp_path):
+    products.main(["--quick", "--out", str(tmp_path)])
+    assert "products alone" in (tmp_path / "products.md").read_text()

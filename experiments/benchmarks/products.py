@@ -1,0 +1,190 @@
+"""What bounds an update: its matrix products alone, each at its own shape, on one core.
+
+Usage: python -m experiments.benchmarks.products [--quick] [--lengths L ...] [--out DIR]
+
+Times every product of an update of `lstm-td3-1ha1hc` (batch 100, width 128) by itself: compiled by
+XLA for one thread, repeated in one program, operands as warm as they get. Their sum is what an
+update would take if gates, activations, gathers, optimisers, acting and the environment cost
+nothing; beside it stand the step as it is, on one core, and the rate of a large product. A share of
+that rate above the one of the sum cannot be had with these products. Writes products.md.
+"""
+
+import argparse
+import dataclasses
+import pathlib
+import statistics
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.benchmarks.ours import make_config
+from rtd3jax.envs.registry import make
+from rtd3jax.study.plan import update_flops
+from rtd3jax.training import lanes
+from rtd3jax.training.run import make_jobs
+
+sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
+from writing import RESULTS, markdown_table  # noqa: E402
+
+AGENT = "lstm-td3-1ha1hc"
+SERIAL = {"xla_cpu_multi_thread_eigen": False}
+
+
+@dataclasses.dataclass(frozen=True)
+class Product:
+    """[m, k] times [k, n], ``count`` times an update; ``transposed``: the left factor is."""
+
+    name: str
+    m: int
+    k: int
+    n: int
+    count: float
+    transposed: bool = False
+
+    @property
+    def flops(self) -> float:
+        """Operations of one."""
+        return 2.0 * self.m * self.k * self.n
+
+
+def products_of(length: int, batch: int, width: int) -> list[Product]:
+    """The wide products of an update, the delayed ones spread over two steps."""
+    rest, gates = length * batch, 4 * width
+    # Forward: target actor, two target critics, two critics; actor and critic every second step.
+    forward, backward = 5 + 1.0, 2 + 0.5
+    return [
+        Product("input, first token", batch, width, gates, forward),
+        Product("input, the other tokens", rest, width, gates, forward),
+        Product("recurrent, forward", batch, width, gates, forward * length),
+        Product("recurrent, backward", batch, gates, width, backward * length),
+        Product("weights' gradients", width, rest, gates, 2 * backward, transposed=True),
+        Product("inputs' gradient", rest, gates, width, backward),
+        Product("first token, backward", batch, gates, width, backward),
+        Product("first token, weights", width, batch, gates, backward, transposed=True),
+        # In the actor's loss the critic sends a gradient back to the action, through its last token.
+        Product("last token, to the action", batch, gates, width, 0.5),
+        Product("heads", batch, width, width, forward + 2 * backward + 0.5),
+    ]
+
+
+def seconds(product: Product, least: float, rounds: int) -> float:
+    """Of one product: the best of some rounds within one compiled loop."""
+    random = np.random.default_rng(0)
+    left = (product.k, product.m) if product.transposed else (product.m, product.k)
+    x = jnp.asarray(random.standard_normal(left, np.float32))
+    y = jnp.asarray(random.standard_normal((product.k, product.n), np.float32))
+
+    def repeat(x, y, times):
+        def once(_, x):
+            # Barriers: the whole product, not the one element that is looked at.
+            factor = jax.lax.optimization_barrier(x)
+            z = jax.lax.optimization_barrier((factor.T if product.transposed else factor) @ y)
+            return x.at[0, 0].set(z[0, 0] * 1e-3)
+
+        return jax.lax.fori_loop(0, times, once, x)
+
+    example = jnp.int32(1)
+    run = jax.jit(repeat, compiler_options=SERIAL).lower(x, y, example).compile()
+    times, best = 1, 0.0
+    while True:
+        began = time.perf_counter()
+        jax.block_until_ready(run(x, y, jnp.int32(times)))
+        best = time.perf_counter() - began
+        if best > least:
+            break
+        times *= 2
+    found = [best]
+    for _ in range(rounds - 1):
+        began = time.perf_counter()
+        jax.block_until_ready(run(x, y, jnp.int32(times)))
+        found.append(time.perf_counter() - began)
+    return min(found) / times
+
+
+def step_seconds(length: int, batch: int, width: int, least: float, rounds: int) -> float:
+    """Of a whole step of one lane on one core, in the sweep's own program: the best round."""
+    config = make_config(AGENT, length, batch_size=batch, hidden_size=width)
+    [job] = make_jobs(make("rover", "ar1-slip"), config, [0])
+    device = lanes.workers()[0]
+    init, advance = lanes._compiled(job.program, job.lane, False, device)
+    state, step, found = init(job.lane), 0, []
+    chunk = 2 * batch
+    for _ in range(1 + rounds):
+        state = jax.block_until_ready(
+            advance(job.lane, state, jnp.int32(step), jnp.int32(step + chunk))
+        )
+        step += chunk
+    took = chunk = 1
+    while len(found) < rounds:
+        began = time.perf_counter()
+        state = jax.block_until_ready(
+            advance(job.lane, state, jnp.int32(step), jnp.int32(step + chunk))
+        )
+        step += chunk
+        took = time.perf_counter() - began
+        if took < least:
+            chunk *= 2
+        else:
+            found.append(took / chunk)
+    return min(found)
+
+
+def report(length: int, batch: int, width: int, size: int, least: float, rounds: int) -> str:
+    """The table of one window length."""
+    large = Product("large", size, size, size, 1)
+    rate = statistics.median(
+        large.flops / seconds(large, least, rounds) for _ in range(1 if rounds == 1 else 3)
+    )
+    body, total = [], 0.0
+    for product in products_of(length, batch, width):
+        each = seconds(product, least, rounds)
+        total += product.count * each
+        body.append(
+            [
+                product.name,
+                f"{product.m} × {product.k} × {product.n}",
+                f"{product.count:g}",
+                f"{1e3 * product.count * each:.2f}",
+                f"{product.flops / each / rate:.2f}",
+            ]
+        )
+    flops = update_flops(make_config(AGENT, length, batch_size=batch, hidden_size=width))
+    step = step_seconds(length, batch, width, least, rounds)
+    body.append(
+        ["**products alone**", "", "", f"**{1e3 * total:.2f}**", f"**{flops / total / rate:.2f}**"]
+    )
+    body.append(
+        [
+            "**the whole step**",
+            "",
+            "",
+            f"**{1e3 * step:.2f}**",
+            f"**{flops / step / rate:.2f}**",
+        ]
+    )
+    header = ["product", "m × k × n", "an update", "ms an update", "of the large product's rate"]
+    title = f"## l = {length}: a large product runs at {rate / 1e9:.0f} GFLOP/s on one core"
+    return f"{title}\n\n{markdown_table(header, body)}\n"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="small, to see that it runs")
+    parser.add_argument("--lengths", type=int, nargs="+", default=[1, 6, 20])
+    parser.add_argument("--out", type=pathlib.Path, default=RESULTS / "benchmarks")
+    options = parser.parse_args(arguments)
+    batch, width, size, least, rounds = 100, 128, 2048, 0.3, 5
+    if options.quick:
+        batch, width, size, least, rounds, options.lengths = 4, 8, 64, 1e-4, 1, [1]
+    text = "\n".join(report(n, batch, width, size, least, rounds) for n in options.lengths)
+    device = f"{jax.devices()[0].device_kind}, JAX {jax.__version__}, one thread"
+    options.out.mkdir(parents=True, exist_ok=True)
+    (options.out / "products.md").write_text(f"{text}\n{device}\n")
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
