@@ -64,7 +64,7 @@ def products_of(length: int, batch: int, width: int) -> list[Product]:
         Product("inputs' gradient", rest, gates, width, backward),
         Product("first token, backward", batch, gates, width, backward),
         Product("first token, weights", width, batch, gates, backward, transposed=True),
-        # In the actor's loss the critic sends a gradient back to the action, through its last token.
+        # In the actor's loss the critic sends a gradient back to the action, by its last token.
         Product("last token, to the action", batch, gates, width, 0.5),
         Product("heads", batch, width, width, forward + 2 * backward + 0.5),
     ]
