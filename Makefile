@@ -2,10 +2,10 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: help venv sweep bench docs lint format test clean
+.PHONY: help venv sweep bench docs lint format test test-slow clean
 
 help:  ## these lines
-	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/:/'
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/:/'
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -37,6 +37,9 @@ format: venv  ## mend what ruff can mend
 
 test: lint  ## lint and the whole test suite
 	$(BIN)/pytest -n 2
+
+test-slow: venv  ## the tests that are too slow for every change
+	$(BIN)/pytest -n 2 -m slow
 
 clean:  ## remove what can be made again (never runs/)
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis build *.egg-info

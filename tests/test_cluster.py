@@ -51,6 +51,7 @@ DEVICES = int(os.environ.get("RTD3JAX_TEST_DEVICES", "2"))
 """Each compiles its own programs, which takes most of the time of this test."""
 
 
+@pytest.mark.slow
 def test_two_processes_with_half_the_devices_each_give_the_bits_of_one_with_all(tmp_path):
     alone, joined = tmp_path / "alone", tmp_path / "joined"
     running = [process(alone, DEVICES)]

@@ -179,6 +179,7 @@ def test_the_log_has_each_evaluation_once_however_often_it_was_cut(whole, tmp_pa
     assert len(read_log(out / LOG)) == len(keys)
 
 
+@pytest.mark.slow
 def test_two_processes_with_a_shard_each_merge_to_the_same_tables(whole, tmp_path):
     out = tmp_path / "run"
     script = "import sys; from rtd3jax import sweep; from rtd3jax.study import references; "

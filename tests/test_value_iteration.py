@@ -15,6 +15,7 @@ def _params():
     return rtd.make("pendulum").default_params.env
 
 
+@pytest.mark.slow
 def test_halving_the_grid_moves_the_mean_by_less_than_0_3():
     coarse, _ = mean_optimal_return(_params(), 20_000, 0, ANGLES, SPEEDS)
     fine, error = mean_optimal_return(_params(), 20_000, 0, 2 * ANGLES, 2 * SPEEDS)

@@ -26,6 +26,7 @@ def test_the_cost_of_checkpoints(capsys):
     assert capsys.readouterr().out.count("%") == 1
 
 
+@pytest.mark.slow
 def test_killed_sweeps_resume_to_the_same_bits(monkeypatch):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", jax.config.jax_compilation_cache_dir)
     assert load(EXPERIMENTS / "reliability" / "kill_and_resume.py").main(["--quick"]) == 0

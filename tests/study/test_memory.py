@@ -44,6 +44,7 @@ def test_lanes_that_do_not_fit_wait_for_their_turn():
         memory.lanes_at_once(jobs, "map", 2, kept)
 
 
+@pytest.mark.slow
 def test_chunks_give_the_same_results():
     from rtd3jax.training.lanes import advance_groups
 
