@@ -151,13 +151,12 @@ def _by_seed(table: pd.DataFrame, key: dict, column: str) -> np.ndarray:
 
 def history_is_nothing(disturbance: str) -> Callable[[Results], list[Effect]]:
     """Claims 1 and 2."""
-    return lambda results: [
-        Equal(
-            "lstm-td3 over lstm-td3-no-action",
-            results.on_pendulum("lstm-td3", disturbance),
-            results.on_pendulum("lstm-td3-no-action", disturbance),
-        )
-    ]
+    return lambda results: equal(history_helps(results, disturbance))
+
+
+def equal(effects: list[Effect]) -> list[Effect]:
+    """The same differences, of which the claim says that there are none."""
+    return [Equal(effect.name, effect.better, effect.worse) for effect in effects]
 
 
 def history_helps(results: Results, disturbance: str) -> list[Effect]:
@@ -191,8 +190,7 @@ def noise(results: Results) -> list[Effect]:
 
 def hidden(results: Results) -> list[Effect]:
     """Claim 6."""
-    found = history_is_nothing("hidden")(results)
-    return found + [Equal(e.name, e.better, e.worse) for e in length_helps(results, "hidden")]
+    return equal(history_helps(results, "hidden") + length_helps(results, "hidden"))
 
 
 def memory_helps(results: Results) -> list[Effect]:

@@ -14,6 +14,7 @@ Returns are normalised: 0 is the uniform-random policy, 1 the fully observed opt
 """
 
 import argparse
+import functools
 import pathlib
 import sys
 import time
@@ -60,27 +61,26 @@ def train(run: pathlib.Path, options: argparse.Namespace, more: list[str]) -> in
     )
 
 
-def scale(disturbances: list[str], episodes: int) -> dict[str, tuple[float, float]]:
-    """Mean return of the uniform-random policy, and the ceiling, of each disturbance."""
-    best = rtd.ceiling(rtd.make("pendulum")).mean
-    found = {}
-    for name in disturbances:
-        disturbance, parameters = parse_disturbance(name)
-        env = rtd.make("pendulum", disturbance, **parameters)
-        returns = rtd.evaluate(rtd.random_policy(env), env, episodes, 0, true_reward=True)
-        found[name] = float(np.mean(returns)), best
-    return found
+@functools.cache
+def scale(name: str) -> tuple[float, float]:
+    """Mean return of the uniform-random policy under a disturbance, and the ceiling."""
+    disturbance, parameters = parse_disturbance(name)
+    env = rtd.make("pendulum", disturbance, **parameters)
+    returns = rtd.evaluate(rtd.random_policy(env), env, REFERENCE_EPISODES, 0, true_reward=True)
+    return float(np.mean(returns)), rtd.ceiling(rtd.make("pendulum")).mean
+
+
+def normalised(lanes: pd.DataFrame, column: str) -> pd.Series:
+    """``true_return`` between the two ends of the disturbance that ``column`` names."""
+    low, high = (lanes[column].map(lambda name, end=end: scale(name)[end]) for end in (0, 1))
+    return (lanes["true_return"] - low) / (high - low)
 
 
 def finals(run: pathlib.Path) -> pd.DataFrame:
     """A row per lane: mean true-state return of the final episodes, and normalised."""
-    episodes = read_table(run / "episodes.parquet", EPISODES)
-    lanes = seed_means(episodes)
+    lanes = seed_means(read_table(run / "episodes.parquet", EPISODES))
     lanes = lanes[lanes["algorithm"].isin(rtd.ALGORITHMS)].copy()
-    ends = scale(sorted(lanes["disturbance"].unique()), REFERENCE_EPISODES)
-    low = lanes["disturbance"].map(lambda name: ends[name][0])
-    high = lanes["disturbance"].map(lambda name: ends[name][1])
-    lanes["normalised"] = (lanes["true_return"] - low) / (high - low)
+    lanes["normalised"] = normalised(lanes, "disturbance")
     return lanes.drop(columns="env").rename(columns={"true_return": "mean"})
 
 
@@ -89,12 +89,9 @@ def generalisation(run: pathlib.Path, episodes: int) -> pd.DataFrame:
     directory = RunDirectory.open(run)
     directory.cells = [cell for cell in directory.cells if cell.disturbance == "random-sine"]
     table = transfer(directory, CONDITIONS, episodes, write=False)
-    ends = scale(list(CONDITIONS), REFERENCE_EPISODES)
     lane = ["algorithm", "history_length", "tested_on", "seed"]
     lanes = table.groupby(lane, as_index=False)["true_return"].mean()
-    low = lanes["tested_on"].map(lambda name: ends[name][0])
-    high = lanes["tested_on"].map(lambda name: ends[name][1])
-    lanes["normalised"] = (lanes["true_return"] - low) / (high - low)
+    lanes["normalised"] = normalised(lanes, "tested_on")
     return lanes
 
 

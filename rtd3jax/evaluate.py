@@ -32,6 +32,17 @@ def evaluate(
     Raises:
         UserError: for an unfit environment or impossible arguments.
     """
+    returns, true_returns = both_returns(policy, env, episodes, seed, params=params)
+    return true_returns if true_reward else returns
+
+
+def both_returns(
+    policy: Any, env: Any, episodes: int, seed: int, *, params: Any = None
+) -> tuple[jax.Array, jax.Array]:
+    """Returns of the reward as given and of the true state's, from the same episodes.
+
+    As `evaluate`, which gives one of the two: float32 [episodes] each.
+    """
     for name, value, low in (("episodes", episodes, 1), ("seed", seed, 0)):
         if isinstance(value, bool) or value != int(value) or not low <= value < 2**32:
             raise UserError(f"{name} must be an integer of at least {low}, not {value!r}")
@@ -50,8 +61,7 @@ def evaluate(
             f"the environment's has {interface.action_size}"
         )
     key = jax.random.key(int(seed))
-    returns, true_returns = _episode_returns(policy, env, params, key, int(episodes))
-    return true_returns if true_reward else returns
+    return _episode_returns(policy, env, params, key, int(episodes))
 
 
 @functools.partial(jax.jit, static_argnames=("env", "episodes"))

@@ -18,6 +18,7 @@ import jax
 from rtd3jax.errors import UserError
 from rtd3jax.study import options as given
 from rtd3jax.study.cluster import train_on_cluster
+from rtd3jax.study.command import exit_status, import_worlds
 from rtd3jax.study.execute import Work, train_here
 from rtd3jax.study.hosts import own_shard, own_share, relaunch
 from rtd3jax.study.lock import parse_shard, writer
@@ -27,11 +28,8 @@ from rtd3jax.study.plan import cell_jobs, make_cells, plan_text
 from rtd3jax.study.references import references_of
 from rtd3jax.study.report.page import refresh_page
 from rtd3jax.study.rundir import RunDirectory
-from rtd3jax.study.worlds import import_worlds
 from rtd3jax.training.lanes import Job, workers
 from rtd3jax.training.run import check_strategy
-
-_UNFINISHED = ("planned", "running", "interrupted")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -47,22 +45,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     before = _on_termination(_terminate)
     try:
-        for module in options.imports:
-            import_worlds(module)
-        if options.distributed and not jax.distributed.is_initialized():
-            relaunch(arguments)
-        if options.device:
-            jax.config.update("jax_default_device", given.device(options.device))
-        return _run(options)
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        # A full disk, say. What was written before is whole, and the same command goes on from it.
-        print(f"error: {error.filename or given.out(options)}: {error.strerror}", file=sys.stderr)
-        return 2
+        return exit_status(lambda: _start(options, arguments), lambda: given.out(options))
     finally:
         _on_termination(before)
+
+
+def _start(options: argparse.Namespace, arguments: Sequence[str] | None) -> int:
+    import_worlds(options.imports)
+    if options.distributed and not jax.distributed.is_initialized():
+        relaunch(arguments)
+    if options.device:
+        jax.config.update("jax_default_device", given.device(options.device))
+    return _run(options)
 
 
 class _Terminated(KeyboardInterrupt):
@@ -139,8 +133,7 @@ def _train(
     directory.derive(references)
     if options.report:
         # Of several processes the last to end has the rest to do.
-        ended = all(row["status"] not in _UNFINISHED for row in directory.ledger())
-        refresh_page(directory, complete=ended and not interrupted)
+        refresh_page(directory, complete=directory.has_ended() and not interrupted)
     print((directory.path / "summary.md").read_text())
     print(f"results: {directory.path}")
     if interrupted:

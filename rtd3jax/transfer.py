@@ -8,29 +8,24 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from rtd3jax.errors import UserError
+from rtd3jax.study.command import exit_status, import_worlds, run_parser
 from rtd3jax.study.report.page import NAME, refresh_page
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.transfer import transfer
-from rtd3jax.study.worlds import import_worlds
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; the exit status: 0 done, 2 bad input."""
     options = _parser().parse_args(arguments)
-    try:
-        for module in options.imports:
-            import_worlds(module)
-        directory = RunDirectory.open(options.run)
-        rows = transfer(directory, options.on, options.episodes)
-        page = directory.path / NAME
-        refresh_page(directory, complete=not page.exists())
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        print(f"error: {error.filename or options.run}: {error.strerror}", file=sys.stderr)
-        return 2
+    return exit_status(lambda: _run(options), lambda: options.run)
+
+
+def _run(options: argparse.Namespace) -> int:
+    import_worlds(options.imports)
+    directory = RunDirectory.open(options.run)
+    rows = transfer(directory, options.on, options.episodes)
+    page = directory.path / NAME
+    refresh_page(directory, complete=not page.exists())
     lanes = ["env", "algorithm", "history_length", "trained_on"]
     means = rows.pivot_table(index=lanes, columns="tested_on", values="return", sort=False)
     print(means.round(3).to_string())
@@ -39,26 +34,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m rtd3jax.transfer",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog="example:\n  python -m rtd3jax.transfer runs/rover --on ar1-slip ar1-slip-fast",
-    )
-    parser.add_argument("run", help="a run directory")
+    parser = run_parser("transfer", __doc__, "runs/rover --on ar1-slip ar1-slip-fast")
     parser.add_argument(
         "--on", nargs="+", metavar="ID", help="disturbances to test on [all those of the run]"
     )
     parser.add_argument(
         "--episodes", type=int, default=100, help="of each policy and disturbance [100]"
-    )
-    parser.add_argument(
-        "--import",
-        dest="imports",
-        action="append",
-        default=[],
-        metavar="MODULE",
-        help="a Python module that registers worlds (rtd3jax.register)",
     )
     return parser
 

@@ -14,6 +14,7 @@ from rtd3jax.errors import UserError
 from rtd3jax.study import cluster, hosts
 from rtd3jax.study.execute import Work
 from rtd3jax.study.plan import Grid, cell_jobs, make_cells
+from rtd3jax.study.rundir import LOG, RunDirectory
 
 STUDY = [
     *("--env", "rover", "--disturbances", "ar1-slip", "--algorithms", "td3"),
@@ -178,3 +179,26 @@ def test_the_tasks_line_is_json(tmp_path):
     directory = type("Directory", (), {"path": tmp_path})
     assert cluster._outcome(ray, None, directory, []) == []
     assert json.loads((tmp_path / cluster.TASKS).read_text())["cell"] == "a"
+
+
+def test_the_growing_log_is_read_once_and_by_whole_lines(tmp_path):
+    cells = make_cells([Grid("rover", ("ar1-slip",), ("td3",))], {})
+    directory = RunDirectory(tmp_path / "run", cells, [0, 1], 2)
+    fed = []
+    logger = type("Logger", (), {"log": lambda self, cell, seed, row: fed.append(row["step"])})()
+
+    def line(seed, step):
+        return json.dumps({**cells[0].key, "seed": seed, "step": step, "return": -1.0}) + "\n"
+
+    path = directory.path / LOG
+    path.write_text(line(0, 10))
+    log = cluster._Log(directory, logger)
+    assert log.steps() == 10 and fed == []  # the trackers had it before
+    with path.open("a") as file:
+        file.write(line(0, 20) + line(1, 10) + line(1, 20)[:30])
+        file.flush()
+        assert log.steps() == 30 and fed == [20, 10]
+        file.write(line(1, 20)[30:])
+        file.flush()
+        assert log.steps() == 40 and fed == [20, 10, 20]
+    assert log.steps() == 40 and len(fed) == 3

@@ -20,11 +20,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.benchmarks.ours import make_config
-from rtd3jax.envs.registry import make
+from experiments.benchmarks.ours import Lanes, make_config
 from rtd3jax.study.plan import update_flops
-from rtd3jax.training import lanes
-from rtd3jax.training.run import make_jobs
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
 from writing import RESULTS, markdown_table  # noqa: E402
@@ -86,49 +83,27 @@ def seconds(product: Product, least: float, rounds: int) -> float:
 
         return jax.lax.fori_loop(0, times, once, x)
 
-    example = jnp.int32(1)
-    run = jax.jit(repeat, compiler_options=SERIAL).lower(x, y, example).compile()
-    times, best = 1, 0.0
-    while True:
+    run = jax.jit(repeat, compiler_options=SERIAL).lower(x, y, jnp.int32(1)).compile()
+
+    def clock(times: int) -> float:
         began = time.perf_counter()
         jax.block_until_ready(run(x, y, jnp.int32(times)))
-        best = time.perf_counter() - began
-        if best > least:
-            break
+        return time.perf_counter() - began
+
+    times = 1
+    while clock(times) <= least:
         times *= 2
-    found = [best]
-    for _ in range(rounds - 1):
-        began = time.perf_counter()
-        jax.block_until_ready(run(x, y, jnp.int32(times)))
-        found.append(time.perf_counter() - began)
-    return min(found) / times
+    return min(clock(times) for _ in range(rounds)) / times
 
 
 def step_seconds(length: int, batch: int, width: int, least: float, rounds: int) -> float:
     """Of a whole step of one lane on one core, in the sweep's own program: the best round."""
-    config = make_config(AGENT, length, batch_size=batch, hidden_size=width)
-    [job] = make_jobs(make("rover", "ar1-slip"), config, [0])
-    device = lanes.workers()[0]
-    init, advance = lanes._compiled(job.program, job.lane, False, device)
-    state, step, found = init(job.lane), 0, []
-    chunk = 2 * batch
-    for _ in range(1 + rounds):
-        state = jax.block_until_ready(
-            advance(job.lane, state, jnp.int32(step), jnp.int32(step + chunk))
-        )
-        step += chunk
-    took = chunk = 1
-    while len(found) < rounds:
-        began = time.perf_counter()
-        state = jax.block_until_ready(
-            advance(job.lane, state, jnp.int32(step), jnp.int32(step + chunk))
-        )
-        step += chunk
-        took = time.perf_counter() - began
-        if took < least:
-            chunk *= 2
-        else:
-            found.append(took / chunk)
+    one = Lanes(make_config(AGENT, length, batch_size=batch, hidden_size=width), 1)
+    one.warm_up(least)
+    found = []
+    for _ in range(rounds):
+        steps, took = one.run(least)
+        found.append(took / steps)
     return min(found)
 
 

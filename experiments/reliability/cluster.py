@@ -20,6 +20,8 @@ import sys
 import tempfile
 import time
 
+from kill_and_resume import contents  # beside this file
+
 STUDY = [
     *("--env", "rover", "--disturbances", "ar1-slip", "ar1-slip-fast", "ar1-slip-slow"),
     *("--algorithms", "td3", "h-td3", "lstm-td3-1ha1hc", "lstm-td3", "--history-lengths", "2"),
@@ -27,8 +29,7 @@ STUDY = [
     *("--learning-starts", "100", "--eval-every", "500", "--eval-episodes", "2"),
     *("--final-episodes", "3", "--checkpoint-every", "200steps", "--quiet", "--no-report"),
 ]
-QUICK = ["--disturbances", "ar1-slip", "--algorithms", "td3", "--total-steps", "1500"]
-TABLES = ("curves.parquet", "episodes.parquet", "summary.md")
+QUICK = ["--disturbances", "ar1-slip", "--algorithms", "td3", "--total-steps", "20000"]
 
 
 def sweep(out, more, address=None):
@@ -36,13 +37,6 @@ def sweep(out, more, address=None):
     where = [] if address is None else ["--cluster", address]
     command = [sys.executable, "-m", "rtd3jax.sweep", *STUDY, *more, "--out", str(out), *where]
     return subprocess.Popen(command, stdout=subprocess.DEVNULL)
-
-
-def contents(out):
-    """What must be equal."""
-    lanes = sorted(out.glob("lanes/**/*.safetensors"))
-    files = [*(out / name for name in TABLES), *lanes]
-    return {str(file.relative_to(out)): file.read_bytes() for file in files}
 
 
 def wait_for_checkpoints(out, process, new=1):

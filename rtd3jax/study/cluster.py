@@ -22,25 +22,31 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from rtd3jax.errors import UserError
-from rtd3jax.study.execute import Work, train_here
+from rtd3jax.study.command import import_worlds
+from rtd3jax.study.early import EarlyAnswers
+from rtd3jax.study.execute import Work, train_here, waiting_jobs
 from rtd3jax.study.loggers import Logger
 from rtd3jax.study.memory import job_bytes
 from rtd3jax.study.plan import Cell, cell_jobs, label
-from rtd3jax.study.report.page import refresh_page
-from rtd3jax.study.results import CELL
-from rtd3jax.study.rundir import LOG, Reference, RunDirectory, cell_name, read_log
-from rtd3jax.study.worlds import import_worlds
+from rtd3jax.study.rundir import (
+    LOG,
+    PACKAGES,
+    Reference,
+    RunDirectory,
+    cell_name,
+    lane_of,
+    parse_log,
+    steps_reached,
+)
 from rtd3jax.training.checkpoint import checkpoint_steps
 from rtd3jax.training.lanes import Job
 from rtd3jax.versions import versions_of
 
-PACKAGES = ("rtd3jax", "jax", "jaxlib", "flax", "optax", "gymnax", "numpy")
 TASKS = "cluster.jsonl"
 """A line per task that ended: its cell, where and when it ran, and from which steps it went on."""
 _POLL_SECONDS = 0.1
 _PROCESS_BYTES = 700 * 2**20
 """Of a worker before it has a lane: Python, JAX and its compiled programs."""
-_EARLY_ANSWERS_SECONDS = 60.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +73,7 @@ def train_on_cluster(
     Args:
         directory: the run, on storage that every node sees under the same path.
         jobs: all lanes of the run.
-        work: how they are trained; ``at_once`` is for each task to find.
+        work: how they are trained.
         complaints: gains a line for each lane or cell that fails.
         references: for the tables that are made meanwhile.
         logger: of trackers, fed by this process.
@@ -78,12 +84,8 @@ def train_on_cluster(
         UserError: when there is no cluster, its nodes cannot do the work, or Ray is not installed.
     """
     waiting: dict[Cell, list[Job]] = {}
-    for job in jobs:
-        if not directory.is_done(*job.owner):
-            waiting.setdefault(job.owner[0], []).append(job)
-    lanes = sum(map(len, waiting.values()))
-    if lanes < len(jobs):
-        print(f"{len(jobs) - lanes} of {len(jobs)} lanes are there already")
+    for job in waiting_jobs(directory, jobs):
+        waiting.setdefault(job.owner[0], []).append(job)
     if not waiting:
         return
     ray = _ray()
@@ -106,8 +108,9 @@ def train_on_cluster(
             index = directory.cells.index(cell)
             arguments = (path, index, seeds, dataclasses.replace(work, quiet=True), need.cpus)
             pending[task.options(**options).remote(*arguments, list(imports))] = members
+        early = EarlyAnswers(directory, references, page=work.page)
         log = _Log(directory, logger)
-        _watch(ray, directory, pending, complaints, references, log, work)
+        _watch(ray, directory, pending, complaints, early, log, work.quiet)
 
 
 def _ray() -> Any:
@@ -212,8 +215,7 @@ def _probe(mark: str, imports: list[str]) -> tuple[dict[str, str], str | None, s
     """On a node: its versions, what it reads at ``mark``, and what else is wrong."""
     problem = None
     try:
-        for module in imports:
-            import_worlds(module)
+        import_worlds(imports)
     except UserError as error:
         problem = str(error)
     path = Path(mark)
@@ -225,8 +227,7 @@ def _train_cell(
 ) -> tuple[list[str], dict[str, Any]]:
     """On a node: train the lanes of a cell that are not done; complaints, and a line of `TASKS`."""
     began = time.time()
-    for module in imports:
-        import_worlds(module)
+    import_worlds(imports)
     directory = RunDirectory.open(path)
     cell = directory.cells[index]
     # All cells, because side by side they share a program as wide as the longest window.
@@ -254,14 +255,14 @@ def _watch(
     directory: RunDirectory,
     pending: dict[Any, list[Job]],
     complaints: list[str],
-    references: Sequence[Reference],
+    early: EarlyAnswers,
     log: "_Log",
-    work: Work,
+    quiet: bool,
 ) -> None:
     """Wait for the tasks; on Ctrl-C they are told to write their checkpoints."""
-    cells, derived = len(pending), time.perf_counter()
+    cells = len(pending)
     try:
-        with _bar(work.quiet) as bar:
+        with _bar(quiet) as bar:
             everything = sum(cell.config.total_steps for cell in directory.cells)
             line = bar.add_task("", total=everything * len(directory.seeds), cells="")
             while pending:
@@ -271,11 +272,8 @@ def _watch(
                     complaints += _outcome(ray, task, directory, jobs)
                 words = f"{cells - len(pending)} of {cells} cells"
                 bar.update(line, completed=log.steps(), cells=words)
-                if done and time.perf_counter() - derived > _EARLY_ANSWERS_SECONDS:
-                    directory.derive(references)
-                    if work.page:
-                        refresh_page(directory, complete=False)
-                    derived = time.perf_counter()
+                if done:
+                    early.refresh()
     except KeyboardInterrupt:
         for task in pending:
             ray.cancel(task, force=False)
@@ -317,26 +315,27 @@ class _Log:
         self._path = directory.path / LOG
         self._cells = {tuple(cell.key.values()): cell for cell in directory.cells}
         self._logger = logger
-        self._steps: dict[tuple, int] = {}
-        self._read = len(read_log(self._path))
-        self._reach(read_log(self._path))
+        self._reached: dict[tuple[Any, ...], int] = {}
+        self._offset = 0
+        self._new_rows()  # what is there already the trackers have
 
     def steps(self) -> int:
         """Steps up to each lane's last evaluation, by now."""
-        rows = read_log(self._path)[self._read :]
-        self._read += len(rows)
-        self._reach(rows)
-        for row in rows if self._logger is not None else ():
-            assert self._logger is not None
-            self._logger.log(self._cells[_key(row)], row["seed"], row)
-        return sum(self._steps.values())
+        for row in self._new_rows():
+            if self._logger is not None:
+                self._logger.log(self._cells[lane_of(row)[:-1]], row["seed"], row)
+        return sum(self._reached.values())
 
-    def _reach(self, rows: Sequence[dict[str, Any]]) -> None:
-        for row in rows:
-            lane = (*_key(row), row["seed"])
-            if lane[:-1] in self._cells:
-                self._steps[lane] = max(self._steps.get(lane, 0), row["step"])
-
-
-def _key(row: dict[str, Any]) -> tuple[Any, ...]:
-    return tuple(row[name] for name in CELL)
+    def _new_rows(self) -> list[dict[str, Any]]:
+        """The study's rows among the lines that were ended since the last call."""
+        if not self._path.exists():
+            return []
+        with self._path.open("rb") as file:
+            file.seek(self._offset)
+            text = file.read()
+        text = text[: text.rfind(b"\n") + 1]
+        self._offset += len(text)
+        rows = [row for row in parse_log(text.decode()) if lane_of(row)[:-1] in self._cells]
+        for lane, step in steps_reached(rows).items():
+            self._reached[lane] = max(step, self._reached.get(lane, 0))
+        return rows

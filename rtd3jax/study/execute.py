@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
+from rtd3jax.study.early import EarlyAnswers
 from rtd3jax.study.loggers import Logger
 from rtd3jax.study.plan import label
 from rtd3jax.study.recorder import Recorder
@@ -46,9 +47,7 @@ def train_here(
 
     With ``references``, tables and page are refreshed now and then.
     """
-    waiting = [job for job in jobs if not directory.is_done(*job.owner)]
-    if len(waiting) < len(jobs):
-        print(f"{len(jobs) - len(waiting)} of {len(jobs)} lanes are there already")
+    waiting = waiting_jobs(directory, jobs)
     for job in waiting:
         directory.error_path(*job.owner).unlink(missing_ok=True)
     if work.at_once < len(waiting) and not work.quiet:
@@ -56,7 +55,8 @@ def train_here(
     devices = workers()[: work.workers]
     groups = make_groups(waiting, work.strategy, len(devices), work.at_once)
     checkpoints = checkpoints_of(directory, work.interval)
-    recorder = Recorder(directory, checkpoints, references, logger, complaints, page=work.page)
+    early = None if references is None else EarlyAnswers(directory, references, page=work.page)
+    recorder = Recorder(directory, checkpoints, early, logger, complaints)
     with Progress(groups, label, enabled=not work.quiet) as bar:
 
         def on_chunk(group: Group) -> None:
@@ -64,6 +64,14 @@ def train_here(
             recorder.update(group)
 
         advance_groups(groups, on_chunk, checkpoints, devices)
+
+
+def waiting_jobs(directory: RunDirectory, jobs: Sequence[Job]) -> list[Job]:
+    """Those that are not done; says so where some are."""
+    waiting = [job for job in jobs if not directory.is_done(*job.owner)]
+    if len(waiting) < len(jobs):
+        print(f"{len(jobs) - len(waiting)} of {len(jobs)} lanes are there already")
+    return waiting
 
 
 def checkpoints_of(

@@ -83,8 +83,8 @@ def learning_curves(
         for axes in grid[:, 0]:
             axes.set_ylabel("mean return")
         handles = [
-            Line2D([], [], color=_colour(name), linewidth=1.8, label=name)
-            for name in _ordered(curves["algorithm"])
+            Line2D([], [], color=colour_of(name), linewidth=1.8, label=name)
+            for name in ordered(curves["algorithm"])
         ]
         _legend(figure, handles + _reference_handles(references))
         return _save(figure, directory, "learning_curves")
@@ -102,7 +102,7 @@ def final_returns(episodes: pd.DataFrame, directory: str | Path) -> list[Path]:
         lanes = seed_means(episodes)
         trained = lanes[~lanes["algorithm"].isin(REFERENCES)]
         tasks = _tasks(lanes)
-        algorithms = _ordered(trained["algorithm"])
+        algorithms = ordered(trained["algorithm"])
         lengths = sorted({int(length) for length in trained["history_length"]})
         rows, columns = math.ceil(max(len(tasks), 1) / 2), min(max(len(tasks), 1), 2)
         width = max(3.8, 0.9 + len(algorithms) * (0.45 + 0.1 * len(lengths)))
@@ -143,14 +143,14 @@ def _curve_row(
         axes.set_title(title if length is None else f"{title}, {_window(length)}")
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.xaxis.set_major_locator(MaxNLocator(5))
-        for name in _ordered(of_task["algorithm"]):
+        for name in ordered(of_task["algorithm"]):
             line = of_task[of_task["algorithm"] == name]
             if name != WINDOWLESS:
                 line = line[line["history_length"] == length]
             steps, mean, std = _band(line)
             if steps.size == 0:
                 continue
-            colour = _colour(name)
+            colour = colour_of(name)
             axes.plot(steps, mean, color=colour, linewidth=1.6, label=name, zorder=3)
             axes.fill_between(steps, mean - std, mean + std, color=colour, alpha=0.15, linewidth=0)
             lower.append(mean - std)
@@ -198,20 +198,20 @@ def _final_panel(
                 np.full(len(finite), x - 0.32 * gap),
                 finite,
                 s=9,
-                color=_colour(name),
+                color=colour_of(name),
                 alpha=0.35,
                 linewidths=0,
                 zorder=2,
             )
             if summary.n >= 2:
                 bounds = [summary.iqm_low, summary.iqm_high]
-                axes.plot([x, x], bounds, color=_colour(name), linewidth=1.6, zorder=3)
+                axes.plot([x, x], bounds, color=colour_of(name), linewidth=1.6, zorder=3)
             axes.plot(
                 x,
                 summary.iqm,
                 marker=markers[length],
                 markersize=6,
-                color=_colour(name),
+                color=colour_of(name),
                 markeredgecolor="white",
                 markeredgewidth=0.7,
                 linestyle="",
@@ -352,14 +352,15 @@ def _title(tasks: list[tuple[str, str]], task: tuple[str, str]) -> str:
     return name if len({env for env, _ in tasks}) == 1 else f"{task[0]}: {name}"
 
 
-def _ordered(names: Iterable[str]) -> list[str]:
+def ordered(names: Iterable[str]) -> list[str]:
     """Distinct trained algorithms in the order of COLOURS, unknown ones last."""
     known = list(COLOURS)
     distinct = set(names) - set(REFERENCES)
     return sorted(distinct, key=lambda n: (known.index(n) if n in COLOURS else len(known), n))
 
 
-def _colour(name: str) -> str:
+def colour_of(name: str) -> str:
+    """An algorithm's colour."""
     return COLOURS.get(name, OTHER_COLOUR)
 
 

@@ -6,6 +6,7 @@ keeps its files or sends them is for its own environment variables to say (``WAN
 ``MLFLOW_TRACKING_URI``); by default all of it stays in the run directory.
 """
 
+import abc
 import contextlib
 import hashlib
 import importlib
@@ -32,34 +33,10 @@ class Logger(Protocol):
         """Write what is not written yet."""
 
 
-class TensorBoard:
-    """Event files in ``RUN/tensorboard/<cell>/seed-<n>``."""
+class PerLane(abc.ABC):
+    """A logger that has a run of its tracker for each lane, begun with the lane's first row."""
 
     def __init__(self, directory: RunDirectory) -> None:
-        self._make = importlib.import_module("tensorboardX").SummaryWriter
-        self._path = directory.path / "tensorboard"
-        self._writers: dict[tuple[str, int], Any] = {}
-
-    def log(self, cell: Cell, seed: int, row: dict[str, Any]) -> None:
-        """A point of the lane's curve."""
-        lane = cell_name(cell), seed
-        if lane not in self._writers:
-            path = self._path / lane[0] / f"seed-{seed}"
-            self._writers[lane] = self._make(str(path))
-        if row["return"] is not None:
-            self._writers[lane].add_scalar(METRIC, row["return"], row["step"])
-
-    def close(self) -> None:
-        """End the files."""
-        for writer in self._writers.values():
-            writer.close()
-
-
-class WandB:
-    """A run of Weights & Biases for each lane; the project is named after the run directory."""
-
-    def __init__(self, directory: RunDirectory) -> None:
-        self._wandb = importlib.import_module("wandb")
         self._path = directory.path
         self._runs: dict[tuple[str, int], Any] = {}
 
@@ -67,48 +44,88 @@ class WandB:
         """A point of the lane's curve."""
         lane = cell_name(cell), seed
         if lane not in self._runs:
-            self._runs[lane] = self._wandb.init(
-                project=os.environ.get("WANDB_PROJECT", self._path.resolve().name),
-                id=_lane_id(self._path, *lane),
-                resume="allow",
-                reinit="create_new",
-                dir=str(self._path),
-                group=lane[0],
-                name=f"{lane[0]} seed {seed}",
-                config={**cell.to_dict(), "seed": seed},
-            )
-            self._runs[lane].define_metric(METRIC, step_metric="step")
+            self._runs[lane] = self._begin(cell, seed)
         if row["return"] is not None:
-            self._runs[lane].log({METRIC: row["return"], "step": row["step"]})
+            self._point(self._runs[lane], row["return"], row["step"])
 
     def close(self) -> None:
         """End the runs."""
         for run in self._runs.values():
-            run.finish()
+            self._end(run)
+
+    @abc.abstractmethod
+    def _begin(self, cell: Cell, seed: int) -> Any:
+        """The lane's run."""
+
+    @abc.abstractmethod
+    def _point(self, run: Any, value: float, step: int) -> None:
+        """Write one value of `METRIC`."""
+
+    @abc.abstractmethod
+    def _end(self, run: Any) -> None:
+        """End a run."""
 
 
-class MLflow:
+class TensorBoard(PerLane):
+    """Event files in ``RUN/tensorboard/<cell>/seed-<n>``."""
+
+    def __init__(self, directory: RunDirectory) -> None:
+        super().__init__(directory)
+        self._make = importlib.import_module("tensorboardX").SummaryWriter
+
+    def _begin(self, cell: Cell, seed: int) -> Any:
+        return self._make(str(self._path / "tensorboard" / cell_name(cell) / f"seed-{seed}"))
+
+    def _point(self, run: Any, value: float, step: int) -> None:
+        run.add_scalar(METRIC, value, step)
+
+    def _end(self, run: Any) -> None:
+        run.close()
+
+
+class WandB(PerLane):
+    """A run of Weights & Biases for each lane; the project is named after the run directory."""
+
+    def __init__(self, directory: RunDirectory) -> None:
+        super().__init__(directory)
+        self._wandb = importlib.import_module("wandb")
+
+    def _begin(self, cell: Cell, seed: int) -> Any:
+        name = cell_name(cell)
+        run = self._wandb.init(
+            project=os.environ.get("WANDB_PROJECT", self._path.resolve().name),
+            id=_lane_id(self._path, name, seed),
+            resume="allow",
+            reinit="create_new",
+            dir=str(self._path),
+            group=name,
+            name=f"{name} seed {seed}",
+            config={**cell.to_dict(), "seed": seed},
+        )
+        run.define_metric(METRIC, step_metric="step")
+        return run
+
+    def _point(self, run: Any, value: float, step: int) -> None:
+        run.log({METRIC: value, "step": step})
+
+    def _end(self, run: Any) -> None:
+        run.finish()
+
+
+class MLflow(PerLane):
     """A run of MLflow for each lane, in the experiment named after the run directory."""
 
     def __init__(self, directory: RunDirectory) -> None:
+        super().__init__(directory)
         mlflow = importlib.import_module("mlflow")
-        self._path = directory.path
         store = f"sqlite:///{(directory.path / 'mlflow.db').resolve()}"
         self._client = mlflow.MlflowClient(os.environ.get("MLFLOW_TRACKING_URI", store))
         name = directory.path.resolve().name
         found = self._client.get_experiment_by_name(name)
         self._experiment = found.experiment_id if found else self._client.create_experiment(name)
-        self._runs: dict[tuple[str, int], str] = {}
 
-    def log(self, cell: Cell, seed: int, row: dict[str, Any]) -> None:
-        """A point of the lane's curve."""
-        lane = cell_name(cell), seed
-        if lane not in self._runs:
-            self._runs[lane] = self._run_of(cell, seed, _lane_id(self._path, *lane))
-        if row["return"] is not None:
-            self._client.log_metric(self._runs[lane], METRIC, row["return"], step=row["step"])
-
-    def _run_of(self, cell: Cell, seed: int, lane: str) -> str:
+    def _begin(self, cell: Cell, seed: int) -> str:
+        lane = _lane_id(self._path, cell_name(cell), seed)
         query = f"tags.lane = '{lane}'"
         for run in self._client.search_runs([self._experiment], query, max_results=1):
             return run.info.run_id
@@ -118,10 +135,11 @@ class MLflow:
             self._client.log_param(run.info.run_id, key, value)
         return run.info.run_id
 
-    def close(self) -> None:
-        """End the runs."""
-        for run in self._runs.values():
-            self._client.set_terminated(run)
+    def _point(self, run: str, value: float, step: int) -> None:
+        self._client.log_metric(run, METRIC, value, step=step)
+
+    def _end(self, run: str) -> None:
+        self._client.set_terminated(run)
 
 
 LOGGERS: dict[str, tuple[str, Callable[[RunDirectory], Logger]]] = {

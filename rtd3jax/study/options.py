@@ -12,6 +12,7 @@ import jax
 from rtd3jax.config import ALGORITHMS, Config
 from rtd3jax.envs.registry import DISTURBANCES, ENVIRONMENTS
 from rtd3jax.errors import UserError
+from rtd3jax.study.command import add_import
 from rtd3jax.study.loggers import LOGGERS
 from rtd3jax.study.plan import PRESETS, Grid
 
@@ -40,14 +41,7 @@ def parser(description: str | None) -> argparse.ArgumentParser:
     study.add_argument(
         "--env", help=f"{', '.join(ENVIRONMENTS)}, a registered id, or any id that gymnax makes"
     )
-    study.add_argument(
-        "--import",
-        dest="imports",
-        action="append",
-        default=[],
-        metavar="MODULE",
-        help="a Python module that registers worlds (rtd3jax.register)",
-    )
+    add_import(study)
     study.add_argument("--disturbances", nargs="+", metavar="ID", help="what is hidden [none]")
     study.add_argument("--algorithms", nargs="+", metavar="ID", help=f"{', '.join(ALGORITHMS)}")
     study.add_argument(

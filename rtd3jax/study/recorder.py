@@ -2,22 +2,18 @@
 
 import json
 import time
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from rtd3jax.evaluate import both_returns
+from rtd3jax.study.early import EarlyAnswers
 from rtd3jax.study.loggers import Logger
 from rtd3jax.study.plan import label
-from rtd3jax.study.references import both_returns
-from rtd3jax.study.report.page import refresh_page
-from rtd3jax.study.rundir import LOG, Reference, RunDirectory
+from rtd3jax.study.rundir import LOG, RunDirectory
 from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.lanes import Group, Job
 from rtd3jax.training.run import curves_of, evaluation_steps, failure_of
-
-EARLY_ANSWERS_SECONDS = 60.0
-"""At most so often are tables, pictures and the page made while the sweep runs."""
 
 
 class Recorder:
@@ -27,23 +23,19 @@ class Recorder:
         self,
         directory: RunDirectory,
         checkpoints: Checkpoints,
-        references: Sequence[Reference] | None,
+        early: EarlyAnswers | None,
         logger: Logger | None,
         complaints: list[str],
-        *,
-        page: bool = True,
     ):
-        """Without ``references``, tables and page are left to whoever started this process."""
+        """Without ``early``, tables and page are left to whoever started this process."""
         self._directory = directory
         self._checkpoints = checkpoints
-        self._references = references
+        self._early = early
         self._logger = logger
-        self._derived = time.perf_counter()
         self._logged: dict[int, int] = {}
         self._there = directory.repair_log()
         self._began = time.perf_counter()
         self._complaints = complaints
-        self._page = page
 
     def update(self, group: Group) -> None:
         """Take note of a chunk that ``group`` has done, of its end, or of its error."""
@@ -61,15 +53,8 @@ class Recorder:
                 self._keep(job, state)
                 self._checkpoints.discard(job)
             group.state = None  # its replay is no longer needed
-            self._answer_early()
-
-    def _answer_early(self) -> None:
-        late = time.perf_counter() - self._derived > EARLY_ANSWERS_SECONDS
-        if self._references is not None and late:
-            self._directory.derive(self._references)
-            if self._page:
-                refresh_page(self._directory, complete=False)
-            self._derived = time.perf_counter()
+            if self._early is not None:
+                self._early.refresh()
 
     def _log(self, group: Group) -> None:
         assert group.returns is not None

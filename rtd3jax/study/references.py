@@ -5,20 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from rtd3jax.evaluate import evaluate
+from rtd3jax.evaluate import both_returns
 from rtd3jax.policy import constant_policy, random_policy
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.rundir import Reference
 
 EPISODES = 1_000
-
-
-def both_returns(policy: Any, env: Any, episodes: int, seed: int) -> list[np.ndarray]:
-    """Returns of the reward as given and of the true state's: [episodes] each."""
-    return [
-        np.asarray(evaluate(policy, env, episodes, seed, true_reward=true))
-        for true in (False, True)
-    ]
 
 
 def references_of(cells: Sequence[Cell]) -> list[Reference]:
@@ -36,6 +28,11 @@ def references_on(cell: Cell) -> list[Reference]:
         params = getattr(params, "env", params)  # of a rover with faults
         policies["constant"] = constant_policy([params.target_speed, params.target_yaw_rate])
     return [
-        Reference(cell.env, cell.disturbance, name, *both_returns(policy, env, EPISODES, 0))
+        Reference(
+            cell.env,
+            cell.disturbance,
+            name,
+            *map(np.asarray, both_returns(policy, env, EPISODES, 0)),
+        )
         for name, policy in policies.items()
     ]

@@ -25,6 +25,7 @@ from rtd3jax.study.figures import final_returns, learning_curves
 from rtd3jax.study.lock import deriver, is_held
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.results import (
+    CELL,
     CURVES,
     EPISODES,
     REFERENCES,
@@ -39,8 +40,7 @@ from rtd3jax.versions import versions_of
 _CURVE_ARRAYS = ("steps", "returns", "true_returns")
 _FINAL_ARRAYS = ("final_returns", "final_true_returns")
 LOG = "log.jsonl"
-_LANE = ("env", "disturbance", "algorithm", "history_length", "seed")
-_PACKAGES = ("rtd3jax", "jax", "jaxlib", "flax", "optax", "gymnax", "numpy")
+PACKAGES = ("rtd3jax", "jax", "jaxlib", "flax", "optax", "gymnax", "numpy")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,6 +145,14 @@ class RunDirectory:
         """Whether the lane was trained to its end."""
         return self.lane_path(cell, seed).exists()
 
+    def has_ended(self) -> bool:
+        """Whether no lane is left to train: each is done, or was lost, or failed."""
+        return all(
+            self.is_done(cell, seed) or self.error_path(cell, seed).exists()
+            for cell in self.cells
+            for seed in self.seeds
+        )
+
     def write_lane(
         self,
         cell: Cell,
@@ -203,7 +211,7 @@ class RunDirectory:
         if log.exists() and not log.read_bytes().endswith(b"\n"):
             with log.open("a") as file:
                 file.write("\n")
-        return {(*_lane_of(row), row["step"]) for row in read_log(log)}
+        return {(*lane_of(row), row["step"]) for row in read_log(log)}
 
     def ledger(self) -> list[dict[str, Any]]:
         """Each lane's state: done, lost, failed, running, interrupted (at a step), or planned.
@@ -212,10 +220,7 @@ class RunDirectory:
         cannot disagree with them.
         """
         begun = "running" if is_held(self.path) else "interrupted"
-        logged: dict[Any, int] = {}
-        for row in read_log(self.path / LOG):
-            lane = _lane_of(row)
-            logged[lane] = max(row["step"], logged.get(lane, 0))
+        logged = steps_reached(read_log(self.path / LOG))
         return [
             {**cell.key, "seed": seed, **self._lane_status(cell, seed, begun, logged)}
             for cell in self.cells
@@ -235,7 +240,7 @@ class RunDirectory:
             return {"status": "failed", "step": 0, "reason": reason}
         steps = checkpoint_steps(self.checkpoint_directory(cell, seed))
         kept = max(steps, default=0)
-        reached = logged.get(_lane_of({**cell.key, "seed": seed}), 0)
+        reached = logged.get(lane_of({**cell.key, "seed": seed}), 0)
         # A lane that is logged to its end but has no file was removed, to be trained again.
         reached = max(kept, reached if reached < cell.config.total_steps else 0)
         reason = f"next start at step {kept:,}" if reached and begun != "running" else ""
@@ -326,19 +331,34 @@ def _read_study(config: Path) -> Any:
 
 def read_log(path: Path) -> list[dict[str, Any]]:
     """Rows of a log; a line that a killed process left half-written is passed over."""
+    return parse_log(path.read_text()) if path.exists() else []
+
+
+def parse_log(text: str) -> list[dict[str, Any]]:
+    """Rows of a part of a log; see `read_log`."""
     rows = []
-    for line in path.read_text().splitlines() if path.exists() else ():
+    for line in text.splitlines():
         try:
             row = json.loads(line)
-            if isinstance(row["step"], int) and _lane_of(row):
+            if isinstance(row["step"], int) and lane_of(row):
                 rows.append(row)
         except (ValueError, KeyError, TypeError):
             continue
     return rows
 
 
-def _lane_of(row: dict[str, Any]) -> tuple[Any, ...]:
-    return tuple(row[name] for name in _LANE)
+def lane_of(row: dict[str, Any]) -> tuple[Any, ...]:
+    """The lane that a row is of: its cell's key and its seed."""
+    return tuple(row[name] for name in (*CELL, "seed"))
+
+
+def steps_reached(rows: Iterable[dict[str, Any]]) -> dict[tuple[Any, ...], int]:
+    """The last step of each lane in a log."""
+    reached: dict[tuple[Any, ...], int] = {}
+    for row in rows:
+        lane = lane_of(row)
+        reached[lane] = max(row["step"], reached.get(lane, 0))
+    return reached
 
 
 def cell_name(cell: Cell) -> str:
@@ -367,7 +387,7 @@ def _made_with() -> dict[str, Any]:
     device = jax.local_devices()[0]
     return {
         "python": platform.python_version(),
-        "versions": versions_of(_PACKAGES),
+        "versions": versions_of(PACKAGES),
         "backend": jax.default_backend(),
         "device": device.device_kind,
         "devices": len(jax.local_devices()),

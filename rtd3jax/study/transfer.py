@@ -1,14 +1,16 @@
 """What the trained agents of a run score under other disturbances than their own."""
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from rtd3jax.envs.registry import make, parse_disturbance
 from rtd3jax.errors import UserError
+from rtd3jax.evaluate import both_returns
 from rtd3jax.files import write_bytes_atomically
-from rtd3jax.study.references import both_returns
 from rtd3jax.study.report.transfer import COLUMNS, FILE
 from rtd3jax.study.rundir import RunDirectory
 
@@ -36,7 +38,9 @@ def transfer(
     """
     rows: list[dict[str, Any]] = []
     worlds: dict[tuple[str, str], Any] = {}
-    problems: dict[tuple[str, str, str], list[int]] = {}
+    problems: dict[tuple[str, str, str], int] = {}
+    # A file is read once, not for each disturbance.
+    policy_of = functools.lru_cache(maxsize=len(directory.seeds))(directory.policy)
     for cell in directory.cells:
         own = list(dict.fromkeys(c.disturbance for c in directory.cells if c.env == cell.env))
         for disturbance in own if tested_on is None else tested_on:
@@ -48,12 +52,10 @@ def transfer(
                 try:
                     if not directory.is_done(cell, seed):
                         continue
-                    policy = directory.policy(cell, seed)
-                    both = both_returns(policy, worlds[world], episodes, seed)
+                    both = both_returns(policy_of(cell, seed), worlds[world], episodes, seed)
                 except UserError as error:
-                    problems.setdefault((cell.disturbance, disturbance, str(error)), []).append(
-                        seed
-                    )
+                    problem = cell.disturbance, disturbance, str(error)
+                    problems[problem] = problems.get(problem, 0) + 1
                     continue
                 rows += [
                     {
@@ -67,10 +69,12 @@ def transfer(
                         "return": float(value),
                         "true_return": float(true),
                     }
-                    for episode, (value, true) in enumerate(zip(*both, strict=True))
+                    for episode, (value, true) in enumerate(
+                        zip(*map(np.asarray, both), strict=True)
+                    )
                 ]
-    for (trained_on, tested, reason), seeds in problems.items():
-        say(f"not tested on {tested}: {len(seeds)} agents trained on {trained_on}: {reason}")
+    for (trained_on, tested, reason), agents in problems.items():
+        say(f"not tested on {tested}: {agents} agents trained on {trained_on}: {reason}")
     if not rows:
         raise UserError(
             f"nothing in {directory.path} could be tested: --status tells what there is"

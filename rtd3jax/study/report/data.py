@@ -9,7 +9,6 @@ import json
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -17,34 +16,41 @@ import pandas as pd
 
 from rtd3jax.config import Config
 from rtd3jax.errors import UserError
-from rtd3jax.study.figures import COLOURS, OTHER_COLOUR
+from rtd3jax.study.figures import colour_of, ordered
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.results import CELL, CURVES, EPISODES, REFERENCES, read_table
-from rtd3jax.study.rundir import LOG, RunDirectory, read_log
-from rtd3jax.study.statistics import Summary, iqm_bands, seed_means, summarise
+from rtd3jax.study.rundir import LOG, RunDirectory, lane_of, read_log, steps_reached
+from rtd3jax.study.statistics import Summary, iqm_bands, summarise
 
 MOST_POINTS = 200
 """Points of a learning curve that are drawn; of a longer one, as many, evenly spaced."""
 
 ON_DARK = {"td3": "#F2F2F2", "lstm-td3": "#3D9BE0"}
-"""Colours of `figures.COLOURS` that a dark page would swallow, made lighter."""
+"""Colours of `rtd3jax.study.figures` that a dark page would swallow, made lighter."""
 
 MEASURES = {"return": "as rewarded", "true_return": "of the true state"}
 
 
 def study_data(
-    directory: RunDirectory, curves: pd.DataFrame, episodes: pd.DataFrame, notes: list[str]
+    directory: RunDirectory,
+    curves: pd.DataFrame,
+    episodes: pd.DataFrame,
+    lanes: pd.DataFrame,
+    notes: list[str],
 ) -> dict[str, Any]:
-    """Everything but ceilings, transfer and playback; ``notes`` gains what is missing."""
-    curves = _with_log(curves, directory)
+    """Everything but ceilings, transfer and playback; ``notes`` gains what is missing.
+
+    ``lanes`` are the `seed_means` of ``episodes``.
+    """
+    log = read_log(directory.path / LOG)
+    curves = _with_log(curves, log, directory)
     worlds = list(dict.fromkeys((cell.env, cell.disturbance) for cell in directory.cells))
-    algorithms = _in_order(cell.config.algorithm for cell in directory.cells)
+    algorithms = ordered(cell.config.algorithm for cell in directory.cells)
     measures = [m for m in MEASURES if m == "return" or _differs(curves, episodes)]
     ledger = _ledger(directory, notes)
     begun = Counter(
         tuple(row[name] for name in CELL) for row in ledger if row["status"] != "planned"
     )
-    lanes = seed_means(episodes)
     return {
         "title": directory.path.resolve().name,
         "measures": [[name, MEASURES[name]] for name in measures],
@@ -60,8 +66,8 @@ def study_data(
         "agents": [
             {
                 "name": name,
-                "colour": COLOURS.get(name, OTHER_COLOUR),
-                "dark": ON_DARK.get(name, COLOURS.get(name, OTHER_COLOUR)),
+                "colour": colour_of(name),
+                "dark": ON_DARK.get(name, colour_of(name)),
             }
             for name in algorithms
         ],
@@ -72,15 +78,15 @@ def study_data(
                 "length": cell.config.history_length,
                 "seeds": len(directory.seeds),
                 "begun": begun[tuple(cell.key[name] for name in CELL)],
-                "curves": {m: _curve(_of(curves, cell), m) for m in measures},
-                "final": {m: _final(_of(lanes, cell), m) for m in measures},
+                "curves": {m: _curve(rows_of(curves, cell), m) for m in measures},
+                "final": {m: _final(rows_of(lanes, cell), m) for m in measures},
             }
             for cell in directory.cells
         ],
         "study": _study(directory.cells, directory.seeds, directory.episodes),
         "status": dict(Counter(row["status"] for row in ledger)),
         "troubles": [row for row in ledger if row["status"] not in ("done", "planned")],
-        "timing": _timing(directory),
+        "timing": _timing(log, directory),
         "made_with": _made_with(directory),
     }
 
@@ -104,14 +110,16 @@ def tables_of(directory: RunDirectory, notes: list[str]) -> tuple[pd.DataFrame, 
     return tables[0], tables[1]
 
 
-def _with_log(curves: pd.DataFrame, directory: RunDirectory) -> pd.DataFrame:
+def _with_log(
+    curves: pd.DataFrame, log: list[dict[str, Any]], directory: RunDirectory
+) -> pd.DataFrame:
     """The curves there are, and those of lanes under way, which only the log has."""
     key = [*CELL, "seed"]
     kept = set(curves[key].itertuples(index=False, name=None))
     study = {(*cell.key.values(), seed) for cell in directory.cells for seed in directory.seeds}
     rows: dict[tuple, dict[str, Any]] = {}
-    for row in read_log(directory.path / LOG):
-        lane = tuple(row[name] for name in key)
+    for row in log:
+        lane = lane_of(row)
         value = row.get("return")
         if lane in study and lane not in kept and isinstance(value, float | int):
             # A lane that was trained again is logged again; the later row holds.
@@ -122,18 +130,14 @@ def _with_log(curves: pd.DataFrame, directory: RunDirectory) -> pd.DataFrame:
     return pd.concat([curves, pd.DataFrame(list(rows.values()))[curves.columns]])
 
 
-def _in_order(names: Iterable[str]) -> list[str]:
-    known = list(COLOURS)
-    return sorted(set(names), key=lambda n: (known.index(n) if n in known else len(known), n))
-
-
 def _differs(curves: pd.DataFrame, episodes: pd.DataFrame) -> bool:
     """Whether the reward that is given is anywhere not the true state's."""
     pairs = [table[["return", "true_return"]].dropna() for table in (curves, episodes)]
     return any(not np.allclose(pair["return"], pair["true_return"]) for pair in pairs)
 
 
-def _of(table: pd.DataFrame, cell: Cell) -> pd.DataFrame:
+def rows_of(table: pd.DataFrame, cell: Cell) -> pd.DataFrame:
+    """The rows of a cell."""
     keep = np.ones(len(table), bool)
     for name, value in cell.key.items():
         keep &= (table[name] == value).to_numpy()
@@ -215,21 +219,16 @@ def _ledger(directory: RunDirectory, notes: list[str]) -> list[dict[str, Any]]:
         return []
 
 
-def _timing(directory: RunDirectory) -> dict[str, Any] | None:
+def _timing(rows: list[dict[str, Any]], directory: RunDirectory) -> dict[str, Any] | None:
     """What the log tells of time: a session's clock starts at zero.
 
     Shards write one log at the same time, each with its own clock; their sum would be no one's
     time, so it is left out.
     """
-    rows = read_log(directory.path / LOG)
     stamps = [row.get("seconds") for row in rows]
     if not rows or not all(isinstance(stamp, int | float) for stamp in stamps):
         return None
-    reached: dict[tuple, int] = {}
-    for row in rows:
-        lane = tuple(row[name] for name in (*CELL, "seed"))
-        reached[lane] = max(reached.get(lane, 0), row["step"])
-    steps = sum(reached.values())
+    steps = sum(steps_reached(rows).values())
     shards = [
         entry for entry in directory.path.iterdir() if re.match(r"\.lock-\d+-of-", entry.name)
     ]

@@ -67,7 +67,8 @@ def page_data(directory: RunDirectory, *, complete: bool, playback: bool) -> dic
     """All that the page's code draws."""
     notes: list[str] = []
     curves, episodes = tables_of(directory, notes)
-    data = study_data(directory, curves, episodes, notes)
+    lanes = seed_means(episodes)
+    data = study_data(directory, curves, episodes, lanes, notes)
     ceilings = ceilings_of(directory, compute=complete)
     for world in data["worlds"]:
         world["ceiling"] = ceilings.get((world["env"], world["disturbance"]))
@@ -78,7 +79,6 @@ def page_data(directory: RunDirectory, *, complete: bool, playback: bool) -> dic
         notes.append(str(error))
     data["playback"] = []
     if playback:
-        lanes = seed_means(episodes)
         data["playback"] = recordings(directory, lanes, record=complete, notes=notes)
     data["notes"] = notes
     data["complete"] = complete

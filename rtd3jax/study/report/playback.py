@@ -27,8 +27,7 @@ from rtd3jax.errors import UserError
 from rtd3jax.evaluate import DEFAULT_STEP_LIMIT
 from rtd3jax.files import write_bytes_atomically
 from rtd3jax.study.plan import Cell
-from rtd3jax.study.report.data import number
-from rtd3jax.study.results import CELL
+from rtd3jax.study.report.data import number, rows_of
 from rtd3jax.study.rundir import RunDirectory
 
 FORMAT = 1
@@ -224,7 +223,7 @@ def _packed(frames: dict[str, np.ndarray]) -> dict[str, Any]:
 
 def _middle_seed(directory: RunDirectory, cell: Cell, lanes: pd.DataFrame) -> int | None:
     """The seed whose final return is the cell's median (the lower one of two): a typical agent."""
-    rows = lanes[(lanes[list(CELL)] == list(cell.key.values())).all(axis=1)]
+    rows = rows_of(lanes, cell)
     rows = rows[np.isfinite(rows["return"])].sort_values(["return", "seed"])
     seeds = [int(seed) for seed in rows["seed"] if directory.is_done(cell, int(seed))]
     return seeds[(len(seeds) - 1) // 2] if seeds else None

@@ -83,3 +83,12 @@ function axes({ width, height, x, y, label }) {
   svg.append(draw('line', { class: 'axis', x1: frame.left, x2: frame.right, y1: frame.bottom, y2: frame.bottom }));
   return { ...frame, svg };
 }
+
+// As many panels side by side as there is room for, each at least so wide.
+function panelGrid(body, panels, narrowest, make) {
+  const columns = Math.max(1, Math.min(panels.length, Math.floor(body.clientWidth / narrowest)));
+  const width = Math.floor((body.clientWidth - (columns - 1) * 26) / columns);
+  const grid = el('div', { class: 'panels', style: `grid-template-columns: repeat(${columns}, minmax(0, 1fr))` });
+  grid.append(...panels.map((panel) => make(panel, width)));
+  body.replaceChildren(grid);
+}

@@ -42,11 +42,7 @@ function drawCurves() {
     body.replaceChildren(el('p', { class: 'missing' }, 'Nothing is selected in the filter above.'));
     return;
   }
-  const columns = Math.max(1, Math.min(panels.length, Math.floor(body.clientWidth / 330)));
-  const width = Math.floor((body.clientWidth - (columns - 1) * 26) / columns);
-  const grid = el('div', { class: 'panels', style: `grid-template-columns: repeat(${columns}, minmax(0, 1fr))` });
-  grid.append(...panels.map((panel) => curvePanel(panel, width)));
-  body.replaceChildren(grid);
+  panelGrid(body, panels, 330, curvePanel);
 }
 
 function legendItems(panels) {

@@ -7,9 +7,9 @@ function worldName(world) {
   const name = world.disturbance === 'none' ? 'no disturbance' : world.disturbance;
   return oneEnv ? name : `${world.env}: ${name}`;
 }
-const lengthName = (length) => (length ? `history ${length}` : 'no history');
+const lengthName = (length) => `history ${length}`;
 const cellName = (cell) =>
-  DATA.agents[cell.agent].name + (cell.length ? `, history ${cell.length}` : '');
+  DATA.agents[cell.agent].name + (cell.length ? `, ${lengthName(cell.length)}` : '');
 const allLengths = [...new Set(DATA.cells.map((cell) => cell.length))].filter(Boolean).sort((a, b) => a - b);
 
 // An agent without a window belongs beside every length.

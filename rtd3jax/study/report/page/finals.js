@@ -13,11 +13,7 @@ function drawFinals() {
     body.replaceChildren(el('p', { class: 'missing' }, 'No lane of what is selected has ended yet.'));
     return;
   }
-  const columns = Math.max(1, Math.min(panels.length, Math.floor(body.clientWidth / 430)));
-  const width = Math.floor((body.clientWidth - (columns - 1) * 26) / columns);
-  const grid = el('div', { class: 'panels', style: `grid-template-columns: repeat(${columns}, minmax(0, 1fr))` });
-  grid.append(...panels.map((panel) => finalPanel(panel, width)));
-  body.replaceChildren(grid);
+  panelGrid(body, panels, 430, finalPanel);
 }
 
 function finalPanel({ world, cells }, width) {

@@ -1,0 +1,62 @@
+"""What the commands have in common: how bad input ends them, and how worlds are brought in."""
+
+import argparse
+import importlib
+import os
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from rtd3jax.errors import UserError
+
+
+def exit_status(work: Callable[[], int], place: Callable[[], Any]) -> int:
+    """What ``work`` returns; 2, and one line for people, where the input or a file is at fault.
+
+    ``place`` names the directory that a failing file operation most likely meant.
+    """
+    try:
+        return work()
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+    except OSError as error:
+        # A full disk, say. What was written before is whole, and the same command goes on from it.
+        print(f"error: {error.filename or place()}: {error.strerror}", file=sys.stderr)
+    return 2
+
+
+def add_import(group: Any) -> None:
+    """Give a parser, or a group of one, the option whose values go to `import_worlds`."""
+    group.add_argument(
+        "--import",
+        dest="imports",
+        action="append",
+        default=[],
+        metavar="MODULE",
+        help="a Python module that registers worlds (rtd3jax.register)",
+    )
+
+
+def run_parser(name: str, description: str | None, example: str) -> argparse.ArgumentParser:
+    """The parser of a command on a run directory, with ``run`` and ``--import``."""
+    parser = argparse.ArgumentParser(
+        prog=f"python -m rtd3jax.{name}",
+        description=description,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=f"example:\n  python -m rtd3jax.{name} {example}",
+    )
+    parser.add_argument("run", help="a run directory")
+    add_import(parser)
+    return parser
+
+
+def import_worlds(modules: Sequence[str]) -> None:
+    """Import what registers worlds (``--import``); found in the working directory too."""
+    for module in modules:
+        sys.path.insert(0, os.getcwd())
+        try:
+            importlib.import_module(module)
+        except ImportError as error:
+            raise UserError(f"--import {module}: {error}") from error
+        finally:
+            sys.path.pop(0)

@@ -1,0 +1,28 @@
+"""Tables, pictures and the page of a run that is still under way."""
+
+import time
+from collections.abc import Sequence
+
+from rtd3jax.study.report.page import refresh_page
+from rtd3jax.study.rundir import Reference, RunDirectory
+
+SECONDS = 60.0
+"""At most so often."""
+
+
+class EarlyAnswers:
+    """Makes them anew, now and then."""
+
+    def __init__(self, directory: RunDirectory, references: Sequence[Reference], *, page: bool):
+        self._directory = directory
+        self._references = references
+        self._page = page
+        self._made = time.perf_counter()
+
+    def refresh(self) -> None:
+        """Make them, unless that was done a moment ago."""
+        if time.perf_counter() - self._made > SECONDS:
+            self._directory.derive(self._references)
+            if self._page:
+                refresh_page(self._directory, complete=False)
+            self._made = time.perf_counter()
