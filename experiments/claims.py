@@ -170,8 +170,8 @@ def history_helps(results: Results, disturbance: str) -> list[Effect]:
 def length_helps(results: Results, disturbance: str) -> list[Effect]:
     """The longest window over the shortest."""
     lengths = results.lengths()
-    if len(lengths) < 2:
-        return []
+    if len(lengths) < 2:  # a comparison that is missing leaves the claim undecided
+        return [Effect("lstm-td3, longest over shortest window", np.empty(0), np.empty(0))]
     long, short = (results.on_pendulum("lstm-td3", disturbance, lengths[k]) for k in (-1, 0))
     return [Effect(f"lstm-td3, l={lengths[-1]} over l={lengths[0]}", long, short)]
 

@@ -6,9 +6,9 @@ Usage: python experiments/pendulum.py [--quick] [--run DIR] [--out DIR] [--steps
 Trains every agent under four disturbances, and `lstm-td3` with and without action history also
 fully observed and under `temporal-bias`, in a run directory of the sweep; the same command goes on
 with what is missing. Then tests the agents of `random-sine` under five other conditions, 1,000
-episodes each. Writes pendulum.md, .parquet and .png, and generalisation.md and .parquet. The paper
-has five seeds, lengths 1 to 20 and width 128; the table says what was run. `--report` does not
-train.
+episodes each. Writes pendulum.md, .parquet and .png, the learning curves, and generalisation.md and
+.parquet. The paper has five seeds, lengths 1 to 20 and width 128; the table says what was run.
+`--report` does not train.
 
 Returns are normalised: 0 is the uniform-random policy, 1 the fully observed optimum.
 """
@@ -34,7 +34,13 @@ from rtd3jax.study.statistics import seed_means
 from rtd3jax.study.transfer import transfer
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
+from writing import (  # noqa: E402
+    RESULTS,
+    keep_curves,
+    markdown_table,
+    provenance,
+    write_results,
+)
 
 DISTURBANCES = ("temporal-sine", "random-sine", "noise", "hidden", "none", "temporal-bias")
 CONDITIONS = (
@@ -172,6 +178,7 @@ def main(arguments: list[str] | None = None) -> int:
     text = table(lanes, "disturbance", DISTURBANCES)
     write_results(options.out, "pendulum", lanes, text, facts)
     draw(lanes, options.out / "pendulum.png")
+    keep_curves(options.run, options.out, "pendulum")
     print(text)
     try:
         carried = generalisation(options.run, episodes)

@@ -4,9 +4,9 @@ Usage: python experiments/rover.py [--quick] [--run DIR] [--out DIR] [--steps N]
 
 Trains six agents under three slips, five seeds each, in a run directory of the sweep; the same
 command goes on with what is missing. Then evaluates every policy there is under the processes of
-the paper's table. Writes rover.md, rover.parquet (a row per policy and process) and rover.png.
-`--report` only evaluates. One setting for all agents: experiments/rover_search.py found it on seeds
-that are not among the five.
+the paper's table. Writes rover.md, rover.parquet (a row per policy and process), rover.png and the
+learning curves. `--report` only evaluates. One setting for all agents: experiments/rover_search.py
+found it on seeds that are not among the five.
 """
 
 import argparse
@@ -24,7 +24,13 @@ import rtd3jax as rtd
 from rtd3jax import sweep
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
+from writing import (  # noqa: E402
+    RESULTS,
+    keep_curves,
+    markdown_table,
+    provenance,
+    write_results,
+)
 
 STEPS = 40_000
 SETTINGS = {
@@ -220,6 +226,7 @@ def main(arguments: list[str] | None = None) -> int:
     text = table(rows, references(episodes))
     write_results(options.out, "rover", rows, text, facts)
     draw(rows, options.out / "rover.png")
+    keep_curves(options.run, options.out, "rover")
     print(text)
     for line in missing:
         print(f"missing: {line}")

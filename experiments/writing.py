@@ -5,6 +5,7 @@ import json
 import os
 import pathlib
 import platform
+import shutil
 
 import jax
 import pandas as pd
@@ -32,6 +33,13 @@ def write_results(
     lines = [markdown.rstrip(), "", *(f"- {key}: {value}" for key, value in facts.items())]
     (out / f"{name}.md").write_text("\n".join(lines) + "\n")
     (out / f"{name}.json").write_text(json.dumps(facts, indent=1, default=str) + "\n")
+
+
+def keep_curves(run: pathlib.Path, out: pathlib.Path, name: str) -> None:
+    """The learning curves that the sweep drew in ``run``, as ``name``_learning_curves.png."""
+    drawn = run / "learning_curves.png"
+    if drawn.exists():
+        shutil.copyfile(drawn, out / f"{name}_learning_curves.png")
 
 
 def markdown_table(header: list[str], rows: list[list[str]]) -> str:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT, describe, foreign_code
 from rtd3jax.errors import UserError
+from rtd3jax.programs import make_room
 
 
 def evaluate(
@@ -60,6 +61,7 @@ def both_returns(
             f"the constant action has {action.size} elements, "
             f"the environment's has {interface.action_size}"
         )
+    make_room()
     key = jax.random.key(int(seed))
     return _episode_returns(policy, env, params, key, int(episodes))
 

@@ -88,7 +88,9 @@ def _run(options: argparse.Namespace) -> int:
     if options.dry_run:
         print(plan_text(cells, seeds, jobs, strategy, memory()))
         return 0
-    at_once = lanes_at_once(jobs, strategy, len(workers()), memory())
+    # On a cluster its nodes, not this machine, must have the memory.
+    fit = len(jobs) if options.cluster else None
+    at_once = fit or lanes_at_once(jobs, strategy, len(workers()), memory())
     interval = given.parse_interval(options.checkpoint_every)
     out = given.out(options)
     shard = _shard(options)

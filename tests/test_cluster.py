@@ -3,8 +3,10 @@
 import json
 import os
 import pathlib
+import socket
 import subprocess
 import sys
+import time
 
 import jax
 import pytest
@@ -137,10 +139,14 @@ def test_on_ray_the_tables_are_the_same_though_nodes_and_driver_die():
 
 
 class FakeRay:
-    """A cluster whose tasks all have the same answer."""
+    """A cluster whose tasks all have the same answer, or raise it."""
 
-    def __init__(self, answer):
+    def __init__(self, answer, alive=()):
         self._answer = answer
+        self._alive = alive
+
+    def nodes(self):
+        return [{**node, "Alive": node["NodeID"] in self._alive} for node in [NODE]]
 
     def remote(self, function):
         return self
@@ -149,7 +155,22 @@ class FakeRay:
         return type("Task", (), {"remote": staticmethod(lambda *_: object())})
 
     def get(self, *_, **__):
+        if isinstance(self._answer, Exception):
+            raise self._answer
         return self._answer
+
+
+NODE = {"NodeID": "a", "NodeManagerAddress": "10.0.0.7"}
+
+
+@pytest.fixture
+def scheduling(monkeypatch):
+    """Of Ray, the one module that probes need."""
+    module = type(sys)("ray.util.scheduling_strategies")
+    module.NodeAffinitySchedulingStrategy = lambda *_, **__: None
+    for name in ("ray", "ray.util"):
+        monkeypatch.setitem(sys.modules, name, type(sys)(name))
+    monkeypatch.setitem(sys.modules, "ray.util.scheduling_strategies", module)
 
 
 @pytest.mark.parametrize(
@@ -159,19 +180,46 @@ class FakeRay:
         ({}, "does not see"),
     ],
 )
-def test_a_node_that_cannot_do_the_work_is_named(change, message, tmp_path, monkeypatch):
-    scheduling = type(sys)("ray.util.scheduling_strategies")
-    scheduling.NodeAffinitySchedulingStrategy = lambda *_, **__: None
-    for name in ("ray", "ray.util"):
-        monkeypatch.setitem(sys.modules, name, type(sys)(name))
-    monkeypatch.setitem(sys.modules, "ray.util.scheduling_strategies", scheduling)
+@pytest.mark.usefixtures("scheduling")
+def test_a_node_that_cannot_do_the_work_is_named(change, message, tmp_path):
     versions = {**cluster.versions_of(cluster.PACKAGES), **change}
     ray = FakeRay((versions, None, None))
     directory = type("Directory", (), {"path": tmp_path})
-    node = {"NodeID": "a", "NodeManagerAddress": "10.0.0.7"}
     with pytest.raises(UserError, match=f"node 10.0.0.7 {message}"):
-        cluster._check_nodes(ray, [node], directory, [])
+        cluster._check_nodes(ray, [NODE], directory, [])
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.usefixtures("scheduling")
+def test_a_node_that_died_meanwhile_is_left_out_and_one_that_cannot_answer_is_not(tmp_path):
+    directory = type("Directory", (), {"path": tmp_path})
+    error = RuntimeError("no answer")
+    cluster._check_nodes(FakeRay(error, alive=()), [NODE], directory, [])
+    with pytest.raises(UserError, match="node 10.0.0.7 cannot work: no answer"):
+        cluster._check_nodes(FakeRay(error, alive=("a",)), [NODE], directory, [])
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:{}", "ray://127.0.0.1:{}", "[::1]:{}"])
+def test_where_nobody_listens_there_is_no_cluster(address):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    began = time.monotonic()
+    with (
+        pytest.raises(UserError, match="there is no Ray cluster"),
+        cluster._connected(FakeRay(None), address.format(port)),
+    ):
+        pass
+    assert time.monotonic() - began < 5.0
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:port", "127.0.0.1:99999", "nowhere.invalid:6379"])
+def test_what_is_no_address_is_refused(address):
+    with (
+        pytest.raises(UserError, match="there is no Ray cluster"),
+        cluster._connected(FakeRay(None), address),
+    ):
+        pass
 
 
 def test_the_tasks_line_is_json(tmp_path):

@@ -1,12 +1,14 @@
-"""What bounds an update: its matrix products alone, each at its own shape, on one core.
+"""What bounds an update: its matrix products alone, each at its own shape, all cores busy.
 
-Usage: python -m experiments.benchmarks.products [--quick] [--lengths L ...] [--out DIR]
+Usage: python -m experiments.benchmarks.products [--quick] [--lengths L ...] [--threads N]
+                                                 [--out DIR]
 
 Times every product of an update of `lstm-td3-1ha1hc` (batch 100, width 128) by itself: compiled by
-XLA for one thread, repeated in one program, operands as warm as they get. Their sum is what an
-update would take if gates, activations, gathers, optimisers, acting and the environment cost
-nothing; beside it stand the step as it is, on one core, and the rate of a large product. A share of
-that rate above the one of the sum cannot be had with these products. Writes products.md.
+XLA for one thread, as many threads at it as there are cores, repeated in one program, operands as
+warm as they get. Their sum is what an update would take if gates, activations, gathers, optimisers,
+acting and the environment cost nothing; beside it stand the step as it is, and the rate of a large
+product. A share of that rate above the one of the sum cannot be had with these products. Writes
+products.md.
 """
 
 import argparse
@@ -15,6 +17,7 @@ import pathlib
 import statistics
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +25,7 @@ import numpy as np
 
 from experiments.benchmarks.ours import Lanes, make_config
 from rtd3jax.study.plan import update_flops
+from rtd3jax.training.lanes import workers
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
 from writing import RESULTS, markdown_table  # noqa: E402
@@ -67,8 +71,8 @@ def products_of(length: int, batch: int, width: int) -> list[Product]:
     ]
 
 
-def seconds(product: Product, least: float, rounds: int) -> float:
-    """Of one product: the best of some rounds within one compiled loop."""
+def seconds(product: Product, least: float, rounds: int, threads: int) -> float:
+    """Per product, of ``threads`` that are at it: the best of some rounds in a compiled loop."""
     random = np.random.default_rng(0)
     left = (product.k, product.m) if product.transposed else (product.m, product.k)
     x = jnp.asarray(random.standard_normal(left, np.float32))
@@ -85,37 +89,46 @@ def seconds(product: Product, least: float, rounds: int) -> float:
 
     run = jax.jit(repeat, compiler_options=SERIAL).lower(x, y, jnp.int32(1)).compile()
 
-    def clock(times: int) -> float:
-        began = time.perf_counter()
+    def work(times: int) -> None:
         jax.block_until_ready(run(x, y, jnp.int32(times)))
-        return time.perf_counter() - began
 
-    times = 1
-    while clock(times) <= least:
-        times *= 2
-    return min(clock(times) for _ in range(rounds)) / times
+    with ThreadPoolExecutor(threads) as pool:
+
+        def clock(times: int) -> float:
+            began = time.perf_counter()
+            list(pool.map(work, [times] * threads))
+            return time.perf_counter() - began
+
+        times = 1
+        while clock(times) <= least:
+            times *= 2
+        return min(clock(times) for _ in range(rounds)) / times / threads
 
 
-def step_seconds(length: int, batch: int, width: int, least: float, rounds: int) -> float:
-    """Of a whole step of one lane on one core, in the sweep's own program: the best round."""
-    one = Lanes(make_config(AGENT, length, batch_size=batch, hidden_size=width), 1)
-    one.warm_up(least)
+def step_seconds(
+    length: int, batch: int, width: int, least: float, rounds: int, threads: int
+) -> float:
+    """Per seed-step of a lane for each thread, in the sweep's own program: the best round."""
+    lanes = Lanes(make_config(AGENT, length, batch_size=batch, hidden_size=width), threads)
+    lanes.warm_up(least)
     found = []
     for _ in range(rounds):
-        steps, took = one.run(least)
+        steps, took = lanes.run(least)
         found.append(took / steps)
     return min(found)
 
 
-def report(length: int, batch: int, width: int, size: int, least: float, rounds: int) -> str:
+def report(
+    length: int, batch: int, width: int, size: int, least: float, rounds: int, threads: int
+) -> str:
     """The table of one window length."""
     large = Product("large", size, size, size, 1)
     rate = statistics.median(
-        large.flops / seconds(large, least, rounds) for _ in range(1 if rounds == 1 else 3)
+        large.flops / seconds(large, least, rounds, threads) for _ in range(1 if rounds == 1 else 3)
     )
     body, total = [], 0.0
     for product in products_of(length, batch, width):
-        each = seconds(product, least, rounds)
+        each = seconds(product, least, rounds, threads)
         total += product.count * each
         body.append(
             [
@@ -127,7 +140,7 @@ def report(length: int, batch: int, width: int, size: int, least: float, rounds:
             ]
         )
     flops = update_flops(make_config(AGENT, length, batch_size=batch, hidden_size=width))
-    step = step_seconds(length, batch, width, least, rounds)
+    step = step_seconds(length, batch, width, least, rounds, threads)
     body.append(
         ["**products alone**", "", "", f"**{1e3 * total:.2f}**", f"**{flops / total / rate:.2f}**"]
     )
@@ -141,7 +154,8 @@ def report(length: int, batch: int, width: int, size: int, least: float, rounds:
         ]
     )
     header = ["product", "m × k × n", "an update", "ms an update", "of the large product's rate"]
-    title = f"## l = {length}: a large product runs at {rate / 1e9:.0f} GFLOP/s on one core"
+    where = "one core" if threads == 1 else f"{threads} cores together"
+    title = f"## l = {length}: large products run at {rate / 1e9:.0f} GFLOP/s on {where}"
     return f"{title}\n\n{markdown_table(header, body)}\n"
 
 
@@ -149,13 +163,15 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="small, to see that it runs")
     parser.add_argument("--lengths", type=int, nargs="+", default=[1, 6, 20])
+    parser.add_argument("--threads", type=int, default=len(workers()), help="[one per core]")
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS / "benchmarks")
     options = parser.parse_args(arguments)
     batch, width, size, least, rounds = 100, 128, 2048, 0.3, 5
     if options.quick:
         batch, width, size, least, rounds, options.lengths = 4, 8, 64, 1e-4, 1, [1]
-    text = "\n".join(report(n, batch, width, size, least, rounds) for n in options.lengths)
-    device = f"{jax.devices()[0].device_kind}, JAX {jax.__version__}, one thread"
+    sizes = batch, width, size, least, rounds, options.threads
+    text = "\n".join(report(n, *sizes) for n in options.lengths)
+    device = f"{jax.devices()[0].device_kind}, JAX {jax.__version__}, threads: {options.threads}"
     options.out.mkdir(parents=True, exist_ok=True)
     (options.out / "products.md").write_text(f"{text}\n{device}\n")
     print(text)

@@ -12,6 +12,7 @@ import json
 import math
 import os
 import platform
+import socket
 import time
 import uuid
 from collections.abc import Iterator, Sequence
@@ -26,7 +27,7 @@ from rtd3jax.study.command import import_worlds
 from rtd3jax.study.early import EarlyAnswers
 from rtd3jax.study.execute import Work, train_here, waiting_jobs
 from rtd3jax.study.loggers import Logger
-from rtd3jax.study.memory import job_bytes
+from rtd3jax.study.memory import job_bytes, lanes_at_once, memory
 from rtd3jax.study.plan import Cell, cell_jobs, label
 from rtd3jax.study.rundir import (
     LOG,
@@ -39,12 +40,13 @@ from rtd3jax.study.rundir import (
     steps_reached,
 )
 from rtd3jax.training.checkpoint import checkpoint_steps
-from rtd3jax.training.lanes import Job
+from rtd3jax.training.lanes import Job, workers
 from rtd3jax.versions import versions_of
 
 TASKS = "cluster.jsonl"
 """A line per task that ended: its cell, where and when it ran, and from which steps it went on."""
 _POLL_SECONDS = 0.1
+_KNOCK_SECONDS = 10.0
 _PROCESS_BYTES = 700 * 2**20
 """Of a worker before it has a lane: Python, JAX and its compiled programs."""
 
@@ -90,9 +92,8 @@ def train_on_cluster(
         return
     ray = _ray()
     with _connected(ray, address):
-        nodes = [node for node in ray.nodes() if node["Alive"]]
-        needs = {cell: _need(members, work, nodes) for cell, members in waiting.items()}
-        _check_nodes(ray, nodes, directory, imports)
+        needs = {cell: _need(members, work, _alive(ray)) for cell, members in waiting.items()}
+        _check_nodes(ray, _alive(ray), directory, imports)
         task = ray.remote(_train_cell)
         pending = {}
         for cell, members in waiting.items():
@@ -113,6 +114,10 @@ def train_on_cluster(
         _watch(ray, directory, pending, complaints, early, log, work.quiet)
 
 
+def _alive(ray: Any) -> list[dict]:
+    return [node for node in ray.nodes() if node["Alive"]]
+
+
 def _ray() -> Any:
     try:
         return importlib.import_module("ray")
@@ -126,8 +131,9 @@ def _connected(ray: Any, address: str) -> Iterator[None]:
     # from a task that asks for none.
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     try:
+        _knock(address)
         ray.init(address=address, log_to_driver=False, logging_level="ERROR")
-    except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
+    except (OSError, ValueError, OverflowError, RuntimeError) as error:
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise UserError(
             f"--cluster {address}: there is no Ray cluster ({reason}); start one with "
@@ -137,6 +143,13 @@ def _connected(ray: Any, address: str) -> Iterator[None]:
         yield
     finally:
         ray.shutdown()
+
+
+def _knock(address: str) -> None:
+    """Ray itself tries for minutes where nobody listens."""
+    host, colon, port = address.rpartition("://")[2].rpartition(":")
+    if colon:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=_KNOCK_SECONDS).close()
 
 
 def _need(members: Sequence[Job], work: Work, nodes: Sequence[dict]) -> Need:
@@ -153,8 +166,8 @@ def _need(members: Sequence[Job], work: Work, nodes: Sequence[dict]) -> Need:
     gpus = 1 if work.strategy == "vmap" else 0
     cpus = min(len(members), int(most["CPU"])) if work.strategy == "map" else 1
     # Under `map` finished chunks leave states behind for all lanes, and work on some.
-    memory = math.ceil(_PROCESS_BYTES + len(members) * state + max(cpus, 1) * working)
-    need = Need(cpus, gpus, memory)
+    size = math.ceil(_PROCESS_BYTES + len(members) * state + max(cpus, 1) * working)
+    need = Need(cpus, gpus, size)
     asked = {"CPU": max(need.cpus, 1), "GPU": need.gpus, "memory": need.memory}
     for name, amount in asked.items():
         if amount > most[name]:
@@ -187,11 +200,14 @@ def _check_nodes(
             where = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
             options = {"num_cpus": 0, "scheduling_strategy": where, "max_retries": 0}
             answer = probe.options(**options).remote(str(mark.resolve()), list(imports))
-            asked[answer] = node["NodeManagerAddress"]
-        for answer, name in asked.items():
+            asked[answer] = node
+        for answer, node in asked.items():
+            name = node["NodeManagerAddress"]
             try:
                 versions, seen, problem = ray.get(answer, timeout=300)
             except Exception as error:
+                if node["NodeID"] not in [other["NodeID"] for other in _alive(ray)]:
+                    continue  # it died shortly before, and Ray had not noticed yet
                 reason = str(error).strip().splitlines()[-1]
                 raise UserError(f"--cluster: node {name} cannot work: {reason}") from error
             if problem:
@@ -236,7 +252,10 @@ def _train_cell(
     complaints: list[str] = []
     kept = [checkpoint_steps(directory.checkpoint_directory(cell, seed)) for seed in seeds]
     training = time.time()
-    train_here(directory, own, dataclasses.replace(work, workers=cpus or None), complaints)
+    # What fits is this node's matter, not the driver's.
+    at_once = lanes_at_once(own, work.strategy, cpus or len(workers()), memory())
+    here = dataclasses.replace(work, workers=cpus or None, at_once=at_once)
+    train_here(directory, own, here, complaints)
     report = {
         "cell": cell_name(cell),
         "seeds": seeds,

@@ -6,17 +6,21 @@ many lanes as there are, under ``vmap``, because there width is nearly free. Eac
 worker that takes the group that lags most, so that five lanes keep two cores equally busy.
 """
 
+import contextlib
 import dataclasses
+import gc
 import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rtd3jax.programs import make_room, on_full
 from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.loop import HEALTHY, Lane, LaneState, Program
 
@@ -284,8 +288,16 @@ _programs: dict[Any, _Compiled] = {}
 _programs_lock = threading.Lock()
 
 
+@on_full
+def _let_go() -> None:
+    """Workers that are inside a program keep it; the others compile, or read it from the cache."""
+    with _programs_lock:
+        _programs.clear()
+
+
 def _compiled(program: Program, lane: Lane, batched: bool, device: Any) -> tuple[Any, Any]:
     """``init`` and ``advance``, compiled once for equal programs."""
+    make_room()
     with _programs_lock:
         key = (program, _structure(lane), batched, device)
         entry = _programs.setdefault(key, _Compiled())
@@ -303,13 +315,26 @@ def _compile(program: Program, lane: Lane, batched: bool, device: Any) -> tuple[
         advance = jax.vmap(advance, in_axes=(0, 0, None, None))
     elif device.platform == "cpu":
         options = {"xla_cpu_multi_thread_eigen": False}
-    state = jax.eval_shape(init, lane)
-    step = jax.ShapeDtypeStruct((), jnp.int32)
-    jitted = jax.jit(advance, donate_argnums=1, compiler_options=options)
-    return (
-        jax.jit(init, compiler_options=options).lower(lane).compile(),
-        jitted.lower(lane, state, step, step).compile(),
-    )
+    begin = jax.jit(init, compiler_options=options)
+    go_on = jax.jit(advance, donate_argnums=1, compiler_options=options)
+    with ThreadPoolExecutor(1) as helper, _no_collection():
+        state, step = begin.eval_shape(lane), jax.ShapeDtypeStruct((), jnp.int32)
+        # The small program is compiled, or read from the cache, while the large one is traced.
+        first = helper.submit(begin.lower(lane).compile)
+        second = go_on.lower(lane, state, step, step).compile()
+        return first.result(), second
+
+
+@contextlib.contextmanager
+def _no_collection() -> Iterator[None]:
+    """Tracing makes many small objects and no garbage; collecting meanwhile takes a tenth of it."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 def _structure(lane: Lane) -> Any:

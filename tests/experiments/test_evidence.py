@@ -120,4 +120,23 @@ def test_the_pendulum_experiment_runs(tmp_path, capsys, monkeypatch):
     assert len(table) == 1 and np.isfinite(table["normalised"]).all()
     assert len(pd.read_parquet(out / "generalisation.parquet")) == 1
     assert (out / "pendulum.png").stat().st_size > 5_000
+    assert (out / "pendulum_learning_curves.png").stat().st_size > 5_000
     assert "not run" in capsys.readouterr().out
+
+    pictures = load(EXPERIMENTS / "pendulum_pictures.py")
+    assert pictures.main(["--quick", "--run", str(run), "--out", str(out)]) == 0
+    assert "missing: " in capsys.readouterr().out
+    assert (out / "pendulum_swing.gif").read_bytes().startswith(b"GIF")
+
+
+def test_pairs_of_precisions_are_compared(tmp_path):
+    pairs = load(EXPERIMENTS / "bfloat16_returns.py")
+    options = ["--quick", "--run", str(tmp_path / "run"), "--out", str(tmp_path)]
+    assert pairs.main(options) == 0
+    table = pd.read_parquet(tmp_path / "bfloat16_returns.parquet")
+    np.testing.assert_allclose(table["difference"], table["bfloat16"] - table["float32"])
+    assert len(table) == 2 and "Mean difference" in (tmp_path / "bfloat16_returns.md").read_text()
+    # Twice the spread needs twice the interval, and five equal differences none.
+    mean, low, high = pairs.interval(np.array([0.1, 0.3, 0.2, 0.2, 0.2]))
+    assert mean == pytest.approx(0.2) and low == pytest.approx(0.2 - 0.0878, abs=1e-4)
+    assert high == pytest.approx(0.2 + 0.0878, abs=1e-4)

@@ -26,6 +26,7 @@ from rtd3jax.envs.rover import Rover
 from rtd3jax.errors import UserError
 from rtd3jax.evaluate import DEFAULT_STEP_LIMIT
 from rtd3jax.files import write_bytes_atomically
+from rtd3jax.programs import make_room
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.report.data import number, rows_of
 from rtd3jax.study.rundir import RunDirectory
@@ -88,6 +89,7 @@ def record_episodes(
     Episodes are those of ``evaluate(policy, env, episodes, seed)``. ``done`` says in which frame an
     episode ended; later frames mean nothing.
     """
+    make_room()
     return {
         name: np.asarray(value)
         for name, value in _play(

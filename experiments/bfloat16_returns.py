@@ -1,0 +1,102 @@
+"""Do returns suffer from bfloat16 products? A paired comparison on the rover.
+
+Usage: python experiments/bfloat16_returns.py [--quick] [--run DIR] [--float32 DIR] [--out DIR]
+
+Trains `lstm-td3-1ha1hc` under AR(1) slip with experiments/rover.py's setting, five seeds, in both
+precisions: a pair shares its initial parameters, its plant's slip and its exploration noise, and is
+tested on the same 1,000 episodes. ``--float32`` takes that side from a run of experiments/rover.py.
+Writes bfloat16_returns.md and .parquet: a row per seed, and the mean difference with its 95%
+interval (Student's t over the five differences). The same command goes on with what is missing.
+"""
+
+import argparse
+import pathlib
+import sys
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+import rtd3jax as rtd
+from rtd3jax import sweep
+from rtd3jax.study.rundir import RunDirectory
+
+sys.path.insert(0, str(pathlib.Path(__file__).parent))
+from rover import SEEDS, SETTINGS, STEPS  # noqa: E402
+from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
+
+AGENT, DISTURBANCE, HISTORY_LENGTH = "lstm-td3-1ha1hc", "ar1-slip", 1
+EPISODES = 1_000
+
+
+def train(run: pathlib.Path, precision: str, more: list[str]) -> int:
+    """Train what is missing; the sweep's exit status."""
+    settings = {**SETTINGS, "precision": precision, "total_steps": STEPS}
+    flags = [f"--{name.replace('_', '-')}={value}" for name, value in settings.items()]
+    return sweep.main(
+        [
+            *("--env", "rover", "--disturbances", DISTURBANCE, "--algorithms", AGENT),
+            *("--history-lengths", str(HISTORY_LENGTH), "--seeds", str(SEEDS)),
+            *("--out", str(run), *flags, *more),
+        ]
+    )
+
+
+def evaluate(run: pathlib.Path, seeds: range, episodes: int) -> list[float]:
+    """Mean return of each seed's policy."""
+    env, which = rtd.make("rover", DISTURBANCE), {"algorithm": AGENT, "disturbance": DISTURBANCE}
+    policies = [rtd.load_policy(run, **which, seed=seed) for seed in seeds]
+    return [
+        float(np.mean(rtd.evaluate(policy, env, episodes, seed=seed)))
+        for seed, policy in zip(seeds, policies, strict=True)
+    ]
+
+
+def interval(differences: np.ndarray) -> tuple[float, float, float]:
+    """Mean difference of pairs and its 95% interval."""
+    mean, error = float(differences.mean()), float(stats.sem(differences))
+    reach = float(stats.t.ppf(0.975, len(differences) - 1)) * error
+    return mean, mean - reach, mean + reach
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
+    parser.add_argument("--run", type=pathlib.Path, default=pathlib.Path("runs/bfloat16"))
+    parser.add_argument("--float32", type=pathlib.Path, help="a run of experiments/rover.py")
+    parser.add_argument("--out", type=pathlib.Path, default=RESULTS / "benchmarks")
+    options = parser.parse_args(arguments)
+    more, seeds, episodes = [], range(SEEDS), EPISODES
+    if options.quick:
+        more = ["--total-steps=40", "--hidden-size=4", "--batch-size=4", "--learning-starts=10"]
+        more += ["--eval-every=40", "--eval-episodes=1", "--final-episodes=1", "--seeds=2"]
+        more += ["--quiet", "--no-report"]
+        seeds, episodes = range(2), 2
+    runs = {"float32": options.float32 or options.run / "float32"}
+    runs["bfloat16"] = options.run / "bfloat16"
+    for precision, run in runs.items():
+        if run != options.float32 and (status := train(run, precision, more)):
+            return status
+    table = pd.DataFrame(
+        {"seed": list(seeds), **{p: evaluate(run, seeds, episodes) for p, run in runs.items()}}
+    )
+    table["difference"] = table["bfloat16"] - table["float32"]
+    mean, low, high = interval(table["difference"].to_numpy())
+    ceiling = rtd.ceiling(rtd.make("rover", DISTURBANCE)).mean
+    text = markdown_table(
+        ["seed", "float32", "bfloat16", "difference"],
+        [[str(int(row[0])), *(f"{value:.3f}" for value in row[1:])] for row in table.to_numpy()],
+    )
+    text += (
+        f"\nMean difference {mean:+.3f} [{low:+.3f}, {high:+.3f}], 95% interval over pairs; "
+        f"positive: bfloat16 is better. The ceiling is {ceiling:.3f}.\n"
+    )
+    steps = RunDirectory.open(runs["bfloat16"]).cells[0].config.total_steps
+    facts = provenance(agent=AGENT, disturbance=DISTURBANCE, episodes=episodes, steps=steps)
+    write_results(options.out, "bfloat16_returns", table, text, facts)
+    print(text)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,100 @@
+"""The pendulum swung up by `td3` and by a recurrent agent under one and the same disturbance.
+
+Usage: python experiments/pendulum_pictures.py [--run DIR] [--disturbance D] [--history-length L]
+                                               [--seed N] [--agents A B] [--out DIR] [--quick]
+
+Loads two policies that experiments/pendulum.py trained and lets them play the same episode. Writes
+pendulum_swing.gif: the pendulum as it is, the one that the sensors report, and what the disturbance
+does to the angular velocity's reading beneath.
+"""
+
+import argparse
+import pathlib
+import sys
+
+import numpy as np
+from matplotlib.animation import FuncAnimation, PillowWriter
+from matplotlib.figure import Figure
+
+import rtd3jax as rtd
+from rtd3jax.study.figures import COLOURS
+from rtd3jax.study.report.playback import record_episodes
+
+sys.path.insert(0, str(pathlib.Path(__file__).parent))
+from writing import RESULTS  # noqa: E402
+
+STEPS, EPISODE = 200, 3
+SEEN = "#D55E00"
+
+
+def tip(observation: np.ndarray) -> np.ndarray:
+    """Where the rod ends, [2], for (cos, sin, velocity); upright is (0, 1), noise may stretch."""
+    return np.array([-observation[1], observation[0]])
+
+
+def animate(plays: dict[str, dict[str, np.ndarray]], path: pathlib.Path, every: int) -> None:
+    figure = Figure(figsize=(7.2, 4.8), layout="constrained")
+    panels = figure.subplots(2, len(plays), height_ratios=(2.2, 1), squeeze=False)
+    moving = []
+    for column, (name, play) in enumerate(plays.items()):
+        top, bottom = panels[:, column]
+        top.set(xlim=(-1.8, 1.8), ylim=(-1.8, 1.8), aspect="equal", xticks=[], yticks=[])
+        bottom.set(xlim=(0, STEPS), xlabel="step")
+        values = np.concatenate([play[kind][:, 2] for kind in ("true", "seen")])
+        bottom.set_ylim(values.min() - 0.5, values.max() + 0.5)
+        (seen_rod,) = top.plot([], [], color=SEEN, lw=2, ls=":", marker="o", label="reported")
+        (rod,) = top.plot([], [], color=COLOURS[name], lw=5, label="true")
+        (seen_line,) = bottom.plot([], [], color=SEEN, lw=1)
+        (line,) = bottom.plot([], [], color=COLOURS[name], lw=1.5)
+        moving.append((top, name, play, rod, seen_rod, line, seen_line))
+        if column == 0:
+            bottom.set_ylabel("angular velocity\nrad/s")
+            top.legend(frameon=False, fontsize=8, loc="lower left")
+
+    def frame(step: int):
+        now = np.arange(step)
+        for top, name, play, rod, seen_rod, line, seen_line in moving:
+            for kind, drawn, below in (("true", rod, line), ("seen", seen_rod, seen_line)):
+                x, y = tip(play[kind][step - 1])
+                drawn.set_data([0, x], [0, y])
+                below.set_data(now, play[kind][:step, 2])
+            top.set_title(f"{name}: return {play['reward'][:step].sum():.0f}", fontsize=10)
+        return []
+
+    FuncAnimation(figure, frame, frames=range(1, STEPS + 1, every)).save(
+        path, writer=PillowWriter(fps=20), dpi=80
+    )
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--run", type=pathlib.Path, default=pathlib.Path("runs/pendulum"))
+    parser.add_argument("--disturbance", default="random-sine")
+    parser.add_argument("--history-length", type=int, default=6)
+    parser.add_argument("--seed", type=int, default=0, help="of the policies")
+    parser.add_argument("--agents", nargs=2, default=["td3", "lstm-td3-1ha1hc"])
+    parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
+    parser.add_argument("--quick", action="store_true", help="few frames")
+    options = parser.parse_args(arguments)
+    env = rtd.make("pendulum", options.disturbance)
+    plays = {}
+    for name in options.agents:
+        which = {"algorithm": name, "disturbance": options.disturbance, "seed": options.seed}
+        if name != "td3":
+            which["history_length"] = options.history_length
+        try:
+            policy = rtd.load_policy(options.run, **which)
+        except rtd.UserError as error:
+            print(f"missing: {error}")
+            continue
+        record = record_episodes(policy, env, EPISODE + 1, 0, STEPS)
+        plays[name] = {kind: values[EPISODE] for kind, values in record.items()}
+    if not plays:
+        return 1
+    options.out.mkdir(parents=True, exist_ok=True)
+    animate(plays, options.out / "pendulum_swing.gif", 50 if options.quick else 2)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
