@@ -4,11 +4,11 @@ Usage: python experiments/pendulum.py [--quick] [--run DIR] [--out DIR] [--steps
                                       [--lengths L ...] [--width H] [--report]
 
 Trains every agent under four disturbances, and `lstm-td3` with and without action history also
-fully observed and under `temporal-bias`, in a run directory of the sweep; the same command goes on
-with what is missing. Then tests the agents of `random-sine` under five other conditions, 1,000
-episodes each. Writes pendulum.md, .parquet and .png, the learning curves, and generalisation.md and
-.parquet. The paper has five seeds, lengths 1 to 20 and width 128; the table says what was run.
-`--report` does not train.
+fully observed, under `temporal-bias` and under stronger noise, in a run directory of the sweep; the
+same command goes on with what is missing. Then tests the agents of `random-sine` under five other
+conditions, 1,000 episodes each. Writes pendulum.md, .parquet and .png, the learning curves, and
+generalisation.md and .parquet. The paper has five seeds, lengths 1 to 20 and width 128; the table
+says what was run. `--report` does not train.
 
 Returns are normalised: 0 is the uniform-random policy, 1 the fully observed optimum.
 """
@@ -42,7 +42,10 @@ from writing import (  # noqa: E402
     write_results,
 )
 
-DISTURBANCES = ("temporal-sine", "random-sine", "noise", "hidden", "none", "temporal-bias")
+DISTURBANCES = (
+    *("temporal-sine", "random-sine", "noise", "hidden"),
+    *("none", "temporal-bias", "noise:sigma=1.0"),
+)
 CONDITIONS = (
     "random-sine",
     "combined-sine",

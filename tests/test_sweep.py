@@ -135,7 +135,7 @@ def test_dry_run_prints_the_plan(tmp_path, capsys):
 def test_presets_have_the_papers_cells():
     assert len(make_cells(PRESETS["rover"], {})) == 18
     # Four disturbances: five agents at five lengths and td3; two disturbances: two agents.
-    assert len(make_cells(PRESETS["pendulum"], {})) == 4 * 26 + 2 * 10
+    assert len(make_cells(PRESETS["pendulum"], {})) == 4 * 26 + 3 * 10
 
 
 def test_status_names_every_lane(tmp_path, capsys):

@@ -78,7 +78,12 @@ LENGTHS = (1, 3, 6, 10, 20)
 _ROVER = Grid("rover", ("ar1-slip", "sine-slip", "none"), ALL_AGENTS)
 _PENDULUM = (
     Grid("pendulum", ("temporal-sine", "random-sine", "noise", "hidden"), ALL_AGENTS, LENGTHS),
-    Grid("pendulum", ("none", "temporal-bias"), ("lstm-td3", "lstm-td3-no-action"), LENGTHS),
+    Grid(
+        "pendulum",
+        ("none", "temporal-bias", "noise:sigma=1.0"),
+        ("lstm-td3", "lstm-td3-no-action"),
+        LENGTHS,
+    ),
 )
 PRESETS: dict[str, tuple[Grid, ...]] = {
     "quick": (

@@ -41,8 +41,10 @@ function referencesOf(world, measure) {
 }
 const dashOf = (reference) => (reference.ceiling ? DASHES.ceiling : DASHES[reference.name]);
 
+// What lies beyond the axis is large: the axis' decimals would say nothing.
 function farWords(reference, decimals) {
-  return `${reference.above ? '\u2191' : '\u2193'} ${reference.name} ${fixed(reference.value, decimals)}`;
+  const large = Math.abs(reference.value) >= 10;
+  return `${reference.above ? '\u2191' : '\u2193'} ${reference.name} ${fixed(reference.value, large ? 0 : decimals)}`;
 }
 
 const tip = {
