@@ -17,6 +17,7 @@ import jax
 
 from rtd3jax.errors import UserError
 from rtd3jax.study import options as given
+from rtd3jax.study.ceilings import compute_ceilings
 from rtd3jax.study.cluster import train_on_cluster
 from rtd3jax.study.command import exit_status, import_worlds
 from rtd3jax.study.execute import Work, train_here
@@ -132,10 +133,13 @@ def _train(
                 train_here(directory, jobs, work, complaints, references, logger)
         except KeyboardInterrupt as interrupt:
             interrupted = 143 if isinstance(interrupt, _Terminated) else 130
+    # Of several processes the last to end has the rest to do.
+    complete = options.report and directory.has_ended() and not interrupted
+    if complete:
+        compute_ceilings(directory.path, directory.cells)
     directory.derive(references)
     if options.report:
-        # Of several processes the last to end has the rest to do.
-        refresh_page(directory, complete=directory.has_ended() and not interrupted)
+        refresh_page(directory, complete=complete)
     print((directory.path / "summary.md").read_text())
     print(f"results: {directory.path}")
     if interrupted:

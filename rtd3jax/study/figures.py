@@ -6,7 +6,7 @@ current figure with the caller. Equal data give equal SVG bytes.
 
 import io
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,12 @@ COLOURS = {
 }
 OTHER_COLOUR = "#56B4E9"
 REFERENCE_COLOUR = "#777777"
-REFERENCE_DASHES = {"random": (0, (2, 2)), "constant": (0, (7, 3))}
+REFERENCE_DASHES: dict[str, Any] = {
+    "random": (0, (2, 2)),
+    "constant": (0, (7, 3)),
+    "ceiling": "solid",
+    "upper bound": (0, (1, 1)),
+}
 # The algorithm without a history window, shown beside every window length.
 WINDOWLESS = "td3"
 MARKERS = "osD^vPX"
@@ -55,15 +60,22 @@ _STYLE: Any = {
 }
 
 
+Ceilings = Mapping[tuple[str, str], Mapping[str, Any]]
+"""Of an (env, disturbance): ``mean`` and ``kind``; see `rtd3jax.study.ceilings`."""
+
+
 def learning_curves(
-    curves: pd.DataFrame, references: pd.DataFrame | None, directory: str | Path
+    curves: pd.DataFrame,
+    references: pd.DataFrame | None,
+    directory: str | Path,
+    ceilings: Ceilings | None = None,
 ) -> list[Path]:
     """Draw mean return against environment steps; return the paths of the PNG and the SVG.
 
     ``curves`` has the columns of CURVES; ``references`` those of EPISODES, of which only the
-    reference policies are used. One panel per disturbance (rows) and history length (columns);
-    a line is the mean over the seeds with a finite value at that step, its band one standard
-    deviation (ddof 1) either side.
+    reference policies are used; ``ceilings`` are drawn where they are known. One panel per
+    disturbance (rows) and history length (columns); a line is the mean over the seeds with a finite
+    value at that step, its band one standard deviation (ddof 1) either side.
 
     The panels of a row share their y-limits: from the lower quartile of all lower band edges
     (or the lowest final mean, if lower, so that no line ends outside) to the highest upper edge.
@@ -76,8 +88,9 @@ def learning_curves(
         figure, grid = _panels(len(tasks), max(len(lengths), 1), width=3.6, height=2.7)
         if not tasks:
             _note_empty(grid[0, 0], "no learning curves")
+        means = {task: _reference_means(references, ceilings, task) for task in tasks}
         for row, task in zip(grid, tasks, strict=False):
-            _curve_row(row, curves, references, task, lengths, _title(tasks, task))
+            _curve_row(row, curves, means[task], task, lengths, _title(tasks, task))
         for axes in grid[-1]:
             axes.set_xlabel("environment steps")
         for axes in grid[:, 0]:
@@ -86,17 +99,19 @@ def learning_curves(
             Line2D([], [], color=colour_of(name), linewidth=1.8, label=name)
             for name in ordered(curves["algorithm"])
         ]
-        _legend(figure, handles + _reference_handles(references))
+        _legend(figure, handles + _reference_handles(means.values()))
         return _save(figure, directory, "learning_curves")
 
 
-def final_returns(episodes: pd.DataFrame, directory: str | Path) -> list[Path]:
+def final_returns(
+    episodes: pd.DataFrame, directory: str | Path, ceilings: Ceilings | None = None
+) -> list[Path]:
     """Draw the final evaluation; return the paths of the PNG and the SVG.
 
     ``episodes`` has the columns of EPISODES. One panel per disturbance with the algorithms along
     x; faint dots are the mean returns of single seeds, the marker is their interquartile mean and
     the bar its 95 % bootstrap interval (none for a single seed). Marker shapes tell the history
-    lengths apart; horizontal lines are the reference policies.
+    lengths apart; horizontal lines are the reference policies, and ``ceilings`` that are known.
     """
     with mpl.rc_context(_STYLE):
         lanes = seed_means(episodes)
@@ -110,9 +125,10 @@ def final_returns(episodes: pd.DataFrame, directory: str | Path) -> list[Path]:
         panels = list(grid.flat)
         if not tasks:
             _note_empty(panels[0], "no final evaluation")
+        means = {task: _reference_means(episodes, ceilings, task) for task in tasks}
         for axes, task in zip(panels, tasks, strict=False):
             _final_panel(axes, _of_task(trained, task), algorithms, lengths)
-            _fit(axes, _of_task(trained, task)["return"], _reference_means(episodes, task))
+            _fit(axes, _of_task(trained, task)["return"], means[task])
             axes.set_title(_title(tasks, task))
         for axes in panels[max(len(tasks), 1) :]:
             axes.remove()
@@ -122,14 +138,14 @@ def final_returns(episodes: pd.DataFrame, directory: str | Path) -> list[Path]:
             Line2D([], [], color="#555555", marker=marker, linestyle="", label=_window(length))
             for length, marker in zip(lengths, _markers(lengths), strict=True)
         ]
-        _legend(figure, handles + _reference_handles(episodes))
+        _legend(figure, handles + _reference_handles(means.values()))
         return _save(figure, directory, "final_returns")
 
 
 def _curve_row(
     row: Iterable[Axes],
     curves: pd.DataFrame,
-    references: pd.DataFrame | None,
+    means: dict[str, float],
     task: tuple[str, str],
     lengths: list[int],
     title: str,
@@ -156,7 +172,6 @@ def _curve_row(
             lower.append(mean - std)
             upper.append(mean + std)
             final.append(mean[-1])
-    means = {} if references is None else _reference_means(references, task)
     edges = np.array([])
     if lower:
         bottom = min(np.quantile(np.concatenate(lower), CLIPPED_SHARE), min(final))
@@ -274,30 +289,37 @@ def _fit(axes: Axes, values: Iterable[float], references: dict[str, float]) -> N
     axes.set_ylim(low - margin, high + margin)
 
 
-def _reference_means(episodes: pd.DataFrame, task: tuple[str, str]) -> dict[str, float]:
-    """Mean return over all finite episodes of each reference policy that has any."""
+def _reference_means(
+    episodes: pd.DataFrame | None, ceilings: Ceilings | None, task: tuple[str, str]
+) -> dict[str, float]:
+    """Mean return over all finite episodes of each reference policy, and the ceiling's."""
     means = {}
-    of_task = _of_task(episodes, task)
-    for name in REFERENCES:
-        values = of_task.loc[of_task["algorithm"] == name, "return"].to_numpy(np.float64)
-        values = values[np.isfinite(values)]
-        if values.size:
-            means[name] = float(values.mean())
+    if episodes is not None:
+        rows = _of_task(episodes, task)
+        for name in REFERENCES:
+            values = rows.loc[rows["algorithm"] == name, "return"].to_numpy(np.float64)
+            values = values[np.isfinite(values)]
+            if values.size:
+                means[name] = float(values.mean())
+    best = (ceilings or {}).get(task, {})
+    if best.get("mean") is not None:
+        means["ceiling" if best["kind"] == "exact" else "upper bound"] = best["mean"]
     return means
 
 
-def _reference_handles(episodes: pd.DataFrame | None) -> list[Line2D]:
-    present = set() if episodes is None else set(episodes["algorithm"])
+def _reference_handles(means: Iterable[dict[str, float]]) -> list[Line2D]:
+    """Legend entries of the names that any panel has."""
+    present = {name for of_task in means for name in of_task}
     return [
         Line2D(
             [],
             [],
             color=REFERENCE_COLOUR,
-            linestyle=REFERENCE_DASHES[name],
+            linestyle=dashes,
             linewidth=1.2,
-            label=f"{name} policy",
+            label=f"{name} policy" if name in REFERENCES else name,
         )
-        for name in REFERENCES
+        for name, dashes in REFERENCE_DASHES.items()
         if name in present
     ]
 

@@ -6,9 +6,11 @@ in which training lanes finished.
 """
 
 import io
+import math
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -135,3 +137,9 @@ def _scalar(value):
 
 def _describe(schema: pa.Schema) -> str:
     return "(" + ", ".join(f"{field.name} {field.type}" for field in schema) + ")"
+
+
+def number(value: Any) -> float | None:
+    """For JSON: five significant digits, or None for what is not finite."""
+    value = float(value)
+    return float(f"{value:.5g}") if math.isfinite(value) else None

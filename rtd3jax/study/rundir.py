@@ -21,6 +21,7 @@ from rtd3jax.errors import UserError
 from rtd3jax.files import flatten, read_arrays, write_arrays, write_bytes_atomically
 from rtd3jax.policy import Policy
 from rtd3jax.saved import restore_policy
+from rtd3jax.study.ceilings import ceilings_of
 from rtd3jax.study.figures import final_returns, learning_curves
 from rtd3jax.study.lock import deriver, is_held
 from rtd3jax.study.plan import Cell
@@ -266,11 +267,12 @@ class RunDirectory:
         write_table(self.path / "episodes.parquet", episodes, EPISODES)
         curve_table = read_table(self.path / "curves.parquet", CURVES)
         episode_table = read_table(self.path / "episodes.parquet", EPISODES)
-        text = summary_markdown(self._excerpt(), curve_table, episode_table, failures)
+        best = ceilings_of(self.path, self.cells, compute=False)
+        text = summary_markdown(self._excerpt(), curve_table, episode_table, failures, best)
         write_bytes_atomically(self.path / "summary.md", text.encode())
         if pictures:
-            learning_curves(curve_table, episode_table, self.path)
-            final_returns(episode_table, self.path)
+            learning_curves(curve_table, episode_table, self.path, best)
+            final_returns(episode_table, self.path, best)
 
     def _read_lane(self, cell: Cell, seed: int, curves: list, episodes: list, failures: list):
         path = self.lane_path(cell, seed)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -17,12 +18,14 @@ def summary_markdown(
     curves: pd.DataFrame,
     episodes: pd.DataFrame,
     failures: Sequence[Mapping],
+    ceilings: Mapping[tuple[str, str], Mapping[str, Any]] | None = None,
 ) -> str:
     """Summarise a study.
 
     ``config_lines`` maps setting names to values, shown in the order given. ``curves`` and
     ``episodes`` have the columns of CURVES and EPISODES. Each of ``failures`` has the entries env,
-    disturbance, algorithm, history_length, seed, step and reason.
+    disturbance, algorithm, history_length, seed, step and reason. ``ceilings`` are those of
+    `rtd3jax.study.ceilings` that are known.
 
     Every cell that occurs anywhere, even only in a failure, gets a row, so that a cell whose
     seeds were all lost is seen as missing instead of silently left out.
@@ -34,14 +37,15 @@ def summary_markdown(
     lines += [
         "Over seeds: mean ± standard deviation, and the interquartile mean (IQM) with its 95 % "
         "bootstrap interval. Seeds are finished / started. Best IQM first. Reference policies "
-        "are not trained; their deviation is over episodes.",
+        "are not trained; their deviation is over episodes. The ceiling is the best possible mean, "
+        "with its standard error.",
         "",
     ]
     started = _started_seeds(curves, lanes, failures)
     tasks = {cell[:2] for cell in started}
     tasks |= set(zip(lanes["env"], lanes["disturbance"], strict=True))
     for task in sorted(tasks):
-        lines += _task_section(task, started, lanes, episodes)
+        lines += _task_section(task, started, lanes, episodes, (ceilings or {}).get(task, {}))
     if not tasks:
         lines += ["No results.", ""]
     lines += ["## Lanes lost", ""] + _failure_lines(failures)
@@ -72,6 +76,7 @@ def _task_section(
     started: Mapping[tuple, set[int]],
     lanes: pd.DataFrame,
     episodes: pd.DataFrame,
+    best: Mapping[str, Any],
 ) -> list[str]:
     """Heading and table of one (env, disturbance)."""
     of_task = _select(lanes, task)
@@ -107,6 +112,11 @@ def _task_section(
             entries = [f"{name} (reference)", "–", "–", _spread(summarise(played["return"])), "–"]
             entries += [_spread(summarise(played["true_return"]))] if differs else []
             lines.append(_row(entries))
+    if best.get("mean") is not None:
+        name = "ceiling" if best["kind"] == "exact" else "ceiling (an upper bound)"
+        error = f" ± {_number(best['error'])}" if best["error"] else ""
+        entries = [name, "–", "–", f"{_number(best['mean'])}{error}", "–"]
+        lines.append(_row(entries + ["–"] * differs))
     return [*lines, ""]
 
 

@@ -13,8 +13,8 @@ from random_policies import random_policy
 import rtd3jax as rtd
 from rtd3jax import report, transfer
 from rtd3jax.ceilings import Ceiling
+from rtd3jax.study import ceilings
 from rtd3jax.study.plan import Grid, make_cells
-from rtd3jax.study.report import ceilings
 from rtd3jax.study.report.playback import record_episodes
 from rtd3jax.study.rundir import Reference, RunDirectory
 

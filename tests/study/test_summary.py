@@ -149,3 +149,19 @@ def test_a_reason_of_several_lines_stays_one_item():
 
 def test_an_empty_study_still_has_a_summary():
     assert "No results." in render([])
+
+
+def test_the_ceiling_is_the_last_row_where_it_is_known():
+    columns = list(rows("td3", 0, [0.0])[0])
+    episodes = pd.DataFrame(rows("td3", 0, [-3.0]), columns=columns)
+    curves = pd.DataFrame(columns=columns).rename(columns={"episode": "step"})
+
+    def last(best):
+        text = summary_markdown({}, curves, episodes, [], {("pendulum", "none"): best})
+        return table(text, "pendulum, none")[-1]
+
+    exact = {"mean": -1.206, "error": 0.001, "kind": "exact"}
+    assert last(exact) == ["ceiling", "–", "–", "-1.206 ± 0.001", "–"]
+    bound = {"mean": -0.5, "error": 0.0, "kind": "upper bound"}
+    assert last(bound) == ["ceiling (an upper bound)", "–", "–", "-0.5", "–"]
+    assert last({"missing": "nobody knows"})[0] == "td3"

@@ -18,7 +18,7 @@ from rtd3jax.config import Config
 from rtd3jax.errors import UserError
 from rtd3jax.study.figures import colour_of, ordered
 from rtd3jax.study.plan import Cell
-from rtd3jax.study.results import CELL, CURVES, EPISODES, REFERENCES, read_table
+from rtd3jax.study.results import CELL, CURVES, EPISODES, REFERENCES, number, read_table
 from rtd3jax.study.rundir import LOG, RunDirectory, lane_of, read_log, steps_reached
 from rtd3jax.study.statistics import Summary, iqm_bands, summarise
 
@@ -89,12 +89,6 @@ def study_data(
         "timing": _timing(log, directory),
         "made_with": _made_with(directory),
     }
-
-
-def number(value: Any) -> float | None:
-    """Five significant digits, or None."""
-    value = float(value)
-    return float(f"{value:.5g}") if math.isfinite(value) else None
 
 
 def tables_of(directory: RunDirectory, notes: list[str]) -> tuple[pd.DataFrame, pd.DataFrame]:

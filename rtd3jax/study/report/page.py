@@ -11,7 +11,7 @@ from typing import Any
 
 from rtd3jax.errors import UserError
 from rtd3jax.files import write_bytes_atomically
-from rtd3jax.study.report.ceilings import ceilings_of
+from rtd3jax.study.ceilings import ceilings_of
 from rtd3jax.study.report.data import study_data, tables_of
 from rtd3jax.study.report.playback import recordings
 from rtd3jax.study.report.transfer import FILE as TRANSFER
@@ -69,7 +69,7 @@ def page_data(directory: RunDirectory, *, complete: bool, playback: bool) -> dic
     curves, episodes = tables_of(directory, notes)
     lanes = seed_means(episodes)
     data = study_data(directory, curves, episodes, lanes, notes)
-    ceilings = ceilings_of(directory, compute=complete)
+    ceilings = ceilings_of(directory.path, directory.cells, compute=complete)
     for world in data["worlds"]:
         world["ceiling"] = ceilings.get((world["env"], world["disturbance"]))
     try:

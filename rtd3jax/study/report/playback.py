@@ -28,7 +28,8 @@ from rtd3jax.evaluate import DEFAULT_STEP_LIMIT
 from rtd3jax.files import write_bytes_atomically
 from rtd3jax.programs import make_room
 from rtd3jax.study.plan import Cell
-from rtd3jax.study.report.data import number, rows_of
+from rtd3jax.study.report.data import rows_of
+from rtd3jax.study.results import number
 from rtd3jax.study.rundir import RunDirectory
 
 FORMAT = 1

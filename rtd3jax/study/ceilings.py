@@ -1,29 +1,33 @@
 """Ceilings of a study's worlds, kept in its run directory once they are computed."""
 
 import json
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from rtd3jax.ceilings import Ceiling, ceiling
 from rtd3jax.errors import UserError
 from rtd3jax.files import write_bytes_atomically
-from rtd3jax.study.report.data import number
-from rtd3jax.study.rundir import RunDirectory
+from rtd3jax.study.plan import Cell
+from rtd3jax.study.results import number
 from rtd3jax.versions import versions_of
 
 FILE = "ceilings.json"
 
 
-def ceilings_of(directory: RunDirectory, *, compute: bool) -> dict[tuple[str, str], dict[str, Any]]:
+def ceilings_of(
+    directory: Path, cells: Sequence[Cell], *, compute: bool
+) -> dict[tuple[str, str], dict[str, Any]]:
     """Of each (env, disturbance): mean, standard error and kind, or the reason for having none.
 
     Without ``compute``, only those that were computed before, by this version.
     """
-    path = directory.path / FILE
+    path = directory / FILE
     version = versions_of(["rtd3jax"])["rtd3jax"]
     kept = _read(path, version)
     found, before = {}, len(kept)
-    for world, cell in {(cell.env, cell.disturbance): cell for cell in directory.cells}.items():
+    for world, cell in {(cell.env, cell.disturbance): cell for cell in cells}.items():
         name = " | ".join(world)
         if name not in kept and compute:
             try:
@@ -36,6 +40,15 @@ def ceilings_of(directory: RunDirectory, *, compute: bool) -> dict[tuple[str, st
         text = json.dumps({"rtd3jax": version, "ceilings": kept}, indent=1)
         write_bytes_atomically(path, text.encode())
     return found
+
+
+def compute_ceilings(directory: Path, cells: Sequence[Cell]) -> None:
+    """Compute and keep what is missing if that can be done; a sweep goes on in any case."""
+    try:
+        ceilings_of(directory, cells, compute=True)
+    except Exception as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        print(f"no ceilings: {reason}", file=sys.stderr)
 
 
 def _entry(best: Ceiling) -> dict[str, Any]:
