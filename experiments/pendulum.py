@@ -176,7 +176,7 @@ def main(arguments: list[str] | None = None) -> int:
         steps=example.total_steps,
         width=example.hidden_size,
         precision=example.precision,
-        minutes=round((time.time() - began) / 60, 1),
+        minutes_of_the_last_call=round((time.time() - began) / 60, 1),
     )
     text = table(lanes, "disturbance", DISTURBANCES)
     write_results(options.out, "pendulum", lanes, text, facts)

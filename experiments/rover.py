@@ -221,7 +221,7 @@ def main(arguments: list[str] | None = None) -> int:
         episodes_per_seed=episodes,
         policies=len(rows.drop_duplicates(["algorithm", "trained_on", "seed"])),
         missing=len(missing),
-        minutes=round((time.time() - began) / 60, 1),
+        minutes_of_the_last_call=round((time.time() - began) / 60, 1),
     )
     text = table(rows, references(episodes))
     write_results(options.out, "rover", rows, text, facts)
