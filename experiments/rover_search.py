@@ -18,8 +18,9 @@ import pandas as pd
 import rtd3jax as rtd
 
 RESULTS = pathlib.Path(__file__).parent / "results" / "rover_search.csv"
-SEEDS = (100, 101)
+FIRST_SEED = 100
 BASE = {
+    "seeds": 2,
     "train_on": "ar1-slip",
     "history_length": 1,
     "total_steps": 20_000,
@@ -34,6 +35,7 @@ BASE = {
     "policy_delay": 2,
     "reward_scale": 1.0,
     "replay_capacity": 100_000,
+    "learning_starts": 1_000,
 }
 CHANGES: tuple[dict, ...] = (
     *(
@@ -99,6 +101,27 @@ CHANGES: tuple[dict, ...] = (
                 "total_steps": 40_000,
                 "replay_capacity": 100_000,
             },
+            # One seed in five ends with a speed that is 0.03 m/s off throughout: what moves the
+            # critic's optimum? Four seeds see such a one.
+            *(
+                {
+                    "seeds": 4,
+                    "learning_rate": 3e-3,
+                    "actor_rate": 0.1,
+                    "total_steps": 40_000,
+                    "replay_capacity": 100_000,
+                    **last,
+                }
+                for last in (
+                    {},
+                    # Random commands cost a hundred times what good ones do: forget them ...
+                    {"replay_capacity": 20_000},
+                    # ... or make fewer of them.
+                    {"learning_starts": 200},
+                    {"learning_rate": 1e-3, "actor_rate": 0.3},
+                    {"batch_size": 256},
+                )
+            ),
         )
     ),
 )
@@ -116,10 +139,11 @@ def search(setting: dict, width: int, episodes: int) -> dict:
         critic_learning_rate=setting["learning_rate"],
         **fields,
     )
-    run = rtd.train(rtd.make("rover", setting["train_on"]), config, SEEDS, progress=False)
+    seeds = range(FIRST_SEED, FIRST_SEED + setting["seeds"])
+    run = rtd.train(rtd.make("rover", setting["train_on"]), config, seeds, progress=False)
     env = rtd.make("rover", "ar1-slip")
     finals = [
-        float(np.mean(rtd.evaluate(run.policy(seed), env, episodes, seed=9))) for seed in SEEDS
+        float(np.mean(rtd.evaluate(run.policy(seed), env, episodes, seed=9))) for seed in seeds
     ]
     return {
         **setting,
@@ -131,7 +155,7 @@ def search(setting: dict, width: int, episodes: int) -> dict:
     }
 
 
-RTD_FIELDS = set(BASE) - {"train_on", "learning_rate", "actor_rate"}
+RTD_FIELDS = set(BASE) - {"seeds", "train_on", "learning_rate", "actor_rate"}
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -142,6 +166,7 @@ def main(arguments: list[str] | None = None) -> None:
     tiny = {"total_steps": 1_200} if options.quick else {}
     width, episodes = (8, 10) if options.quick else (128, 1_000)
     rows = pd.read_csv(options.out).to_dict("records") if options.out.exists() else []
+    rows = [{**BASE, **row} for row in rows]  # what was not varied then stood at its default
     for change in CHANGES[:2] if options.quick else CHANGES:
         setting = {**BASE, **change, **tiny}
         if any(all(row[name] == value for name, value in setting.items()) for row in rows):
