@@ -3,9 +3,10 @@
 Usage: python experiments/pendulum_pictures.py [--run DIR] [--disturbance D] [--history-length L]
                                                [--seed N] [--agents A B] [--out DIR] [--quick]
 
-Loads two policies that experiments/pendulum.py trained and lets them play the same episode. Writes
-pendulum_swing.gif: the pendulum as it is, the one that the sensors report, and what the disturbance
-does to the angular velocity's reading beneath.
+Loads two policies that experiments/pendulum.py trained and lets them play the same twenty episodes;
+shown is the one in which their returns differ by the median. Writes pendulum_swing.gif: the
+pendulum as it is, the one that the sensors report, and what the disturbance does to the angular
+velocity's reading beneath.
 """
 
 import argparse
@@ -23,7 +24,7 @@ from rtd3jax.study.report.playback import record_episodes
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from writing import RESULTS  # noqa: E402
 
-STEPS, EPISODE = 200, 3
+STEPS, EPISODES = 200, 20
 SEEN = "#D55E00"
 
 
@@ -87,10 +88,12 @@ def main(arguments: list[str] | None = None) -> int:
         except rtd.UserError as error:
             print(f"missing: {error}")
             continue
-        record = record_episodes(policy, env, EPISODE + 1, 0, STEPS)
-        plays[name] = {kind: values[EPISODE] for kind, values in record.items()}
+        plays[name] = record_episodes(policy, env, EPISODES, 0, STEPS)
     if not plays:
         return 1
+    returns = np.stack([play["reward"].sum(axis=(1, 2)) for play in plays.values()])
+    typical = np.argsort(returns[-1] - returns[0])[EPISODES // 2]
+    plays = {name: {k: v[typical] for k, v in play.items()} for name, play in plays.items()}
     options.out.mkdir(parents=True, exist_ok=True)
     animate(plays, options.out / "pendulum_swing.gif", 50 if options.quick else 2)
     return 0
