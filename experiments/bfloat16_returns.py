@@ -22,22 +22,20 @@ from rtd3jax import sweep
 from rtd3jax.study.rundir import RunDirectory
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-from rover import SEEDS, SETTINGS, STEPS  # noqa: E402
+from rover import EPISODES, HISTORY_LENGTH, SEEDS, SETTINGS, STEPS, flags  # noqa: E402
 from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
 
-AGENT, DISTURBANCE, HISTORY_LENGTH = "lstm-td3-1ha1hc", "ar1-slip", 1
-EPISODES = 1_000
+AGENT, DISTURBANCE = "lstm-td3-1ha1hc", "ar1-slip"
 
 
 def train(run: pathlib.Path, precision: str, more: list[str]) -> int:
     """Train what is missing; the sweep's exit status."""
     settings = {**SETTINGS, "precision": precision, "total_steps": STEPS}
-    flags = [f"--{name.replace('_', '-')}={value}" for name, value in settings.items()]
     return sweep.main(
         [
             *("--env", "rover", "--disturbances", DISTURBANCE, "--algorithms", AGENT),
             *("--history-lengths", str(HISTORY_LENGTH), "--seeds", str(SEEDS)),
-            *("--out", str(run), *flags, *more),
+            *("--out", str(run), *flags(settings), *more),
         ]
     )
 

@@ -14,7 +14,6 @@ import pathlib
 import sys
 
 import numpy as np
-from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.figure import Figure
 
 import rtd3jax as rtd
@@ -22,6 +21,7 @@ from rtd3jax.study.figures import COLOURS
 from rtd3jax.study.report.playback import record_episodes
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
+from pictures import load_policies, save_gif  # noqa: E402
 from writing import RESULTS  # noqa: E402
 
 STEPS, EPISODES = 200, 20
@@ -62,9 +62,7 @@ def animate(plays: dict[str, dict[str, np.ndarray]], path: pathlib.Path, every: 
             top.set_title(f"{name}: return {play['reward'][:step].sum():.0f}", fontsize=10)
         return []
 
-    FuncAnimation(figure, frame, frames=range(1, STEPS + 1, every)).save(
-        path, writer=PillowWriter(fps=20), dpi=80
-    )
+    save_gif(figure, frame, path, STEPS, every)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -78,17 +76,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="few frames")
     options = parser.parse_args(arguments)
     env = rtd.make("pendulum", options.disturbance)
-    plays = {}
-    for name in options.agents:
-        which = {"algorithm": name, "disturbance": options.disturbance, "seed": options.seed}
-        if name != "td3":
-            which["history_length"] = options.history_length
-        try:
-            policy = rtd.load_policy(options.run, **which)
-        except rtd.UserError as error:
-            print(f"missing: {error}")
-            continue
-        plays[name] = record_episodes(policy, env, EPISODES, 0, STEPS)
+    which = {"disturbance": options.disturbance, "seed": options.seed}
+    policies = load_policies(options.run, options.agents, options.history_length, **which)
+    plays = {
+        name: record_episodes(policy, env, EPISODES, 0, STEPS) for name, policy in policies.items()
+    }
     if not plays:
         return 1
     returns = np.stack([play["reward"].sum(axis=(1, 2)) for play in plays.values()])

@@ -70,14 +70,18 @@ PAPER = {
 """Mean ± standard deviation over five seeds (Omi et al., the rover's two tables)."""
 
 
+def flags(settings: dict[str, object]) -> list[str]:
+    """Fields of the configuration, for the sweep's command line."""
+    return [f"--{name.replace('_', '-')}={value}" for name, value in settings.items()]
+
+
 def train(run: pathlib.Path, steps: int, more: list[str]) -> int:
     """Train what is missing; the sweep's exit status."""
-    flags = [f"--{name.replace('_', '-')}={value}" for name, value in SETTINGS.items()]
     return sweep.main(
         [
             *("--preset", "rover", "--history-lengths", str(HISTORY_LENGTH)),
             *("--seeds", str(SEEDS), "--total-steps", str(steps), "--out", str(run)),
-            *flags,
+            *flags(SETTINGS),
             *more,
         ]
     )

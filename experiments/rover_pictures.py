@@ -14,12 +14,12 @@ import sys
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.figure import Figure
 
 import rtd3jax as rtd
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
+from pictures import load_policies, save_gif  # noqa: E402
 from writing import RESULTS  # noqa: E402
 
 COLOURS = {"td3": "#000000", "lstm-td3-1ha1hc": "#009E73"}
@@ -120,9 +120,7 @@ def animate(drives: dict[str, dict[str, np.ndarray]], path: pathlib.Path, every:
             line.set_data(now, slip[:step, wheel])
         return []
 
-    FuncAnimation(figure, frame, frames=range(1, STEPS + 1, every)).save(
-        path, writer=PillowWriter(fps=20), dpi=80
-    )
+    save_gif(figure, frame, path, STEPS, every)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -134,16 +132,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="few frames")
     options = parser.parse_args(arguments)
     env = rtd.make("rover", "ar1-slip")
-    drives = {}
-    for name in options.agents:
-        try:
-            policy = rtd.load_policy(
-                options.run, algorithm=name, disturbance="ar1-slip", seed=options.seed
-            )
-        except rtd.UserError as error:
-            print(f"missing: {error}")
-            continue
-        drives[name] = drive(policy, env, seed=3)
+    policies = load_policies(options.run, options.agents, disturbance="ar1-slip", seed=options.seed)
+    drives = {name: drive(policy, env, seed=3) for name, policy in policies.items()}
     if not drives:
         return 1
     options.out.mkdir(parents=True, exist_ok=True)

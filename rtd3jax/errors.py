@@ -12,3 +12,8 @@ def nearest(word: str, choices: Iterable[str]) -> str:
     """Return ``"; did you mean 'x'?"`` for the choice most like ``word``, or ``""`` if none is."""
     matches = difflib.get_close_matches(str(word), [str(c) for c in choices], n=1)
     return f"; did you mean {matches[0]!r}?" if matches else ""
+
+
+def first_line(error: BaseException) -> str:
+    """The first line of a foreign error's message, or its type where it has none."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]

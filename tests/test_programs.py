@@ -27,7 +27,15 @@ def train():
 
 
 def test_letting_programs_go_all_the_time_changes_no_number(monkeypatch, always_full):
+    compiled, let_go = lanes._compiled, []
+
+    def after_letting_go(*arguments):
+        let_go.append(programs.make_room())
+        return compiled(*arguments)
+
+    monkeypatch.setattr(lanes, "_compiled", after_letting_go)
     often = train()
+    assert len(let_go) > 2 and all(let_go)
     monkeypatch.undo()
     once = train()
     np.testing.assert_array_equal(often.returns, once.returns)

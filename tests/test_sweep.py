@@ -134,7 +134,7 @@ def test_dry_run_prints_the_plan(tmp_path, capsys):
 
 def test_presets_have_the_papers_cells():
     assert len(make_cells(PRESETS["rover"], {})) == 18
-    # Four disturbances: five agents at five lengths and td3; two disturbances: two agents.
+    # Four disturbances: five agents at five lengths and td3; three disturbances: two agents.
     assert len(make_cells(PRESETS["pendulum"], {})) == 4 * 26 + 3 * 10
 
 

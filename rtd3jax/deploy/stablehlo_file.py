@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rtd3jax.deploy.model import Model
-from rtd3jax.errors import UserError
+from rtd3jax.errors import UserError, first_line
 from rtd3jax.files import array_bytes, read_arrays
 
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
@@ -172,6 +172,6 @@ def load_stablehlo(path: str | os.PathLike) -> StableHlo:
     try:
         exported = jax.export.deserialize(bytearray(arrays["program"].tobytes()))
     except Exception as error:  # of many kinds, and all mean the same
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        reason = first_line(error)
         raise UserError(f"{path} cannot be read by this version of JAX ({reason})") from error
     return StableHlo(about, exported)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rtd3jax.ceilings import Ceiling, ceiling
-from rtd3jax.errors import UserError
+from rtd3jax.errors import UserError, first_line
 from rtd3jax.files import write_bytes_atomically
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.results import number
@@ -47,7 +47,7 @@ def compute_ceilings(directory: Path, cells: Sequence[Cell]) -> None:
     try:
         ceilings_of(directory, cells, compute=True)
     except Exception as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        reason = first_line(error)
         print(f"no ceilings: {reason}", file=sys.stderr)
 
 

@@ -22,7 +22,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from rtd3jax.errors import UserError
+from rtd3jax.errors import UserError, first_line
 from rtd3jax.study.command import import_worlds
 from rtd3jax.study.early import EarlyAnswers
 from rtd3jax.study.execute import Work, train_here, waiting_jobs
@@ -134,7 +134,7 @@ def _connected(ray: Any, address: str) -> Iterator[None]:
         _knock(address)
         ray.init(address=address, log_to_driver=False, logging_level="ERROR")
     except (OSError, ValueError, OverflowError, RuntimeError) as error:
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        reason = first_line(error)
         raise UserError(
             f"--cluster {address}: there is no Ray cluster ({reason}); start one with "
             "ray start --head"

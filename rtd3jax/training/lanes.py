@@ -297,9 +297,10 @@ def _let_go() -> None:
 
 def _compiled(program: Program, lane: Lane, batched: bool, device: Any) -> tuple[Any, Any]:
     """``init`` and ``advance``, compiled once for equal programs."""
-    make_room()
+    key = (program, _structure(lane), batched, device)
+    if key not in _programs:
+        make_room()
     with _programs_lock:
-        key = (program, _structure(lane), batched, device)
         entry = _programs.setdefault(key, _Compiled())
     with entry.lock:
         if entry.executables is None:

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from rtd3jax.errors import UserError
+from rtd3jax.errors import UserError, first_line
 from rtd3jax.files import write_bytes_atomically
 from rtd3jax.study.ceilings import ceilings_of
 from rtd3jax.study.report.data import study_data, tables_of
@@ -59,7 +59,7 @@ def refresh_page(directory: RunDirectory, *, complete: bool) -> None:
     try:
         write_page(directory, complete=complete)
     except Exception as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        reason = first_line(error)
         print(f"{NAME} was not written: {reason}", file=sys.stderr)
 
 

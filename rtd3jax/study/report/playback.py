@@ -23,7 +23,7 @@ from rtd3jax.envs.interface import foreign_code
 from rtd3jax.envs.pendulum import Pendulum
 from rtd3jax.envs.process import Chain
 from rtd3jax.envs.rover import Rover
-from rtd3jax.errors import UserError
+from rtd3jax.errors import UserError, first_line
 from rtd3jax.evaluate import DEFAULT_STEP_LIMIT
 from rtd3jax.files import write_bytes_atomically
 from rtd3jax.programs import make_room
@@ -156,7 +156,7 @@ def _recorded(
     except UserError:
         raise
     except Exception as error:  # a user's environment may do anything
-        raise UserError((str(error).splitlines() or [type(error).__name__])[0]) from error
+        raise UserError(first_line(error)) from error
     cut = limit > MOST_STEPS and not frames["done"].any(axis=1).all()
     return {
         **_scene(env, frames["seen"].shape[-1], frames["true"].shape[-1]),
