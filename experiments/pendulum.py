@@ -1,7 +1,8 @@
 """The paper's pendulum figures: agents, disturbances, window lengths, and what action history adds.
 
 Usage: python experiments/pendulum.py [--quick] [--run DIR] [--out DIR] [--steps N] [--seeds N]
-                                      [--lengths L ...] [--width H] [--report]
+                                      [--lengths L ...] [--width H] [--disturbances D ...]
+                                      [--report]
 
 Trains every agent under four disturbances, and `lstm-td3` with and without action history also
 fully observed, under `temporal-bias` and under stronger noise, in a run directory of the sweep; the
@@ -61,6 +62,8 @@ REFERENCE_EPISODES = 1_000
 def train(run: pathlib.Path, options: argparse.Namespace, more: list[str]) -> int:
     """Train what is missing; the sweep's exit status."""
     lengths = [str(length) for length in options.lengths]
+    if options.disturbances:
+        more = [*more, "--disturbances", *options.disturbances, "--algorithms", *rtd.ALGORITHMS]
     return sweep.main(
         [
             *("--preset", "pendulum", "--history-lengths", *lengths, "--out", str(run)),
@@ -151,6 +154,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--lengths", type=int, nargs="+", default=[1, 3, 6, 10, 20])
     parser.add_argument("--width", type=int, default=128)
+    parser.add_argument("--disturbances", nargs="+", metavar="D", help="no others")
     parser.add_argument("--report", action="store_true", help="no training")
     options = parser.parse_args(arguments)
     began, more, episodes = time.time(), [], GENERALISATION_EPISODES

@@ -80,6 +80,15 @@ class Lanes:
                 last[worker] = max(end, last.get(worker, end))
         return self._steps() - before, float(np.mean(list(last.values()))) - began
 
+    def program_text(self) -> str:
+        """The compiled program of the first group, as XLA prints it; it must have been compiled."""
+        program = self.groups[0].jobs[0].program
+        return next(
+            entry.executables[1].as_text()
+            for (known, *_), entry in lanes._programs.items()
+            if known == program and entry.executables is not None
+        )
+
     def fill_replay(self, steps: int) -> None:
         """As if ``steps`` steps had been done: random rows of 200-step episodes in every slot."""
         random = np.random.default_rng(0)
