@@ -95,10 +95,10 @@ def default_strategy() -> str:
 def workers() -> list[Any]:
     """The device of each worker: one worker per accelerator, or one per CPU core.
 
-    On a CPU all workers share JAX's one device. Their programs are compiled without Eigen's threads,
-    so that the cores are shared out by lanes and not within a product (XLA's runtime may still move
-    whole kernels between its threads); a second device would only compile everything a second
-    time. Where XLA was told to show several CPU devices, each of them has a worker.
+    On a CPU all workers share JAX's one device. Their programs are compiled without Eigen's
+    threads, so that the cores are shared out by lanes and not within a product (XLA's runtime may
+    still move whole kernels between its threads); a second device would only compile everything a
+    second time. Where XLA was told to show several CPU devices, each of them has a worker.
     """
     first = _default_device()
     if first.platform == "cpu" and len(jax.local_devices(backend="cpu")) == 1:
