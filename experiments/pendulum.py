@@ -63,7 +63,7 @@ def train(run: pathlib.Path, options: argparse.Namespace, more: list[str]) -> in
     """Train what is missing; the sweep's exit status."""
     lengths = [str(length) for length in options.lengths]
     if options.disturbances:
-        more = [*more, "--disturbances", *options.disturbances, "--algorithms", *rtd.ALGORITHMS]
+        more = ["--disturbances", *options.disturbances, "--algorithms", *rtd.ALGORITHMS, *more]
     return sweep.main(
         [
             *("--preset", "pendulum", "--history-lengths", *lengths, "--out", str(run)),
@@ -89,11 +89,26 @@ def normalised(lanes: pd.DataFrame, column: str) -> pd.Series:
 
 
 def finals(run: pathlib.Path) -> pd.DataFrame:
-    """A row per lane: mean true-state return of the final episodes, and normalised."""
+    """A row per lane: mean true-state return of the final episodes, and normalised; its size."""
     lanes = seed_means(read_table(run / "episodes.parquet", EPISODES))
     lanes = lanes[lanes["algorithm"].isin(rtd.ALGORITHMS)].copy()
     lanes["normalised"] = normalised(lanes, "disturbance")
+    config = RunDirectory.open(run).cells[0].config
+    lanes = lanes.assign(steps=config.total_steps, width=config.hidden_size)
     return lanes.drop(columns="env").rename(columns={"true_return": "mean"})
+
+
+def with_others(lanes: pd.DataFrame, path: pathlib.Path) -> pd.DataFrame:
+    """``lanes``, and those of the table at ``path`` that trained under other disturbances."""
+    if not path.exists():
+        return lanes
+    kept = pd.read_parquet(path)
+    return pd.concat([lanes, kept[~kept["disturbance"].isin(lanes["disturbance"])]])
+
+
+def sizes(lanes: pd.DataFrame, column: str) -> dict[str, int]:
+    """``steps`` or ``width`` of each disturbance."""
+    return {name: int(own[column].iloc[0]) for name, own in lanes.groupby("disturbance")}
 
 
 def generalisation(run: pathlib.Path, episodes: int) -> pd.DataFrame:
@@ -139,7 +154,7 @@ def draw(lanes: pd.DataFrame, path: pathlib.Path) -> None:
                 axes.plot(x, values.mean(), "_", ms=9, mew=2, color=COLOURS[algorithm])
         axes.axhline(1.0, color="#777777", lw=0.8)
         axes.set_xticks(range(len(rtd.ALGORITHMS)), rtd.ALGORITHMS, rotation=60, ha="right")
-        axes.set_title(name)
+        axes.set_title(f"{name}\n{sizes(here, 'steps')[name]:,} steps", fontsize=10)
         axes.grid(axis="y", color="#E4E4E4", lw=0.6)
     panels[0].set_ylabel("normalised return")
     figure.savefig(path, dpi=150)
@@ -162,7 +177,7 @@ def main(arguments: list[str] | None = None) -> int:
         options.steps, options.seeds, options.lengths, options.width = 40, 1, [1], 4
         more = ["--batch-size=4", "--learning-starts=10", "--eval-every=40", "--eval-episodes=1"]
         more += ["--final-episodes=1", "--quiet", "--no-report", "--algorithms", "td3"]
-        more += ["--disturbances", "random-sine"]
+        more += ["--disturbances", *(options.disturbances or ["random-sine"])]
         episodes = 2
     status = 0 if options.report else train(options.run, options, more)
     if status not in (0, 1):
@@ -171,21 +186,27 @@ def main(arguments: list[str] | None = None) -> int:
     if lanes.empty:
         print(f"nothing is trained in {options.run} yet")
         return 1
-    example = RunDirectory.open(options.run).cells[0].config
-    facts = provenance(
-        normalised="0 is the uniform-random policy, 1 the fully observed optimum",
-        lanes=len(lanes),
-        seeds=sorted(int(seed) for seed in lanes["seed"].unique()),
-        lengths=sorted(int(length) for length in lanes["history_length"].unique()),
-        steps=example.total_steps,
-        width=example.hidden_size,
-        precision=example.precision,
-        minutes_of_the_last_call=round((time.time() - began) / 60, 1),
-    )
+    name, carried_from = "pendulum", lanes[lanes["disturbance"] == "random-sine"]
+    if options.disturbances:
+        name = f"pendulum_{options.steps}_steps"
+        lanes = with_others(lanes, options.out / "pendulum.parquet")
+
+    def facts(lanes: pd.DataFrame) -> dict[str, object]:
+        return provenance(
+            normalised="0 is the uniform-random policy, 1 the fully observed optimum",
+            lanes=len(lanes),
+            seeds=sorted(int(seed) for seed in lanes["seed"].unique()),
+            lengths=sorted(int(length) for length in lanes["history_length"].unique()),
+            steps=sizes(lanes, "steps"),
+            width=sizes(lanes, "width"),
+            precision=RunDirectory.open(options.run).cells[0].config.precision,
+            minutes_of_the_last_call=round((time.time() - began) / 60, 1),
+        )
+
     text = table(lanes, "disturbance", DISTURBANCES)
-    write_results(options.out, "pendulum", lanes, text, facts)
+    write_results(options.out, "pendulum", lanes, text, facts(lanes))
     draw(lanes, options.out / "pendulum.png")
-    keep_curves(options.run, options.out, "pendulum")
+    keep_curves(options.run, options.out, name)
     print(text)
     try:
         carried = generalisation(options.run, episodes)
@@ -193,7 +214,9 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"missing: generalisation: {error}")
         return 0
     text = table(carried, "tested_on", CONDITIONS)
-    write_results(options.out, "generalisation", carried, text, {**facts, "episodes": episodes})
+    write_results(
+        options.out, "generalisation", carried, text, {**facts(carried_from), "episodes": episodes}
+    )
     print(text)
     return 0
 

@@ -123,6 +123,14 @@ def test_the_pendulum_experiment_runs(tmp_path, capsys, monkeypatch):
     assert (out / "pendulum_learning_curves.png").stat().st_size > 5_000
     assert "not run" in capsys.readouterr().out
 
+    more = ["--disturbances", "hidden", "--run", str(tmp_path / "more"), "--out", str(out)]
+    assert pendulum.main(["--quick", *more]) == 0
+    both = pd.read_parquet(out / "pendulum.parquet").set_index("disturbance")
+    assert set(both.index) == {"random-sine", "hidden"} and set(both["steps"]) == {40}
+    assert both["mean"]["random-sine"] == table["mean"][0]
+    assert (out / "pendulum_40_steps_learning_curves.png").exists()
+    assert "missing: generalisation" in capsys.readouterr().out
+
     pictures = load(EXPERIMENTS / "pendulum_pictures.py")
     assert pictures.main(["--quick", "--run", str(run), "--out", str(out)]) == 0
     assert "missing: " in capsys.readouterr().out
