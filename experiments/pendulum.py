@@ -183,6 +183,8 @@ def main(arguments: list[str] | None = None) -> int:
     if status not in (0, 1):
         return status
     lanes = finals(options.run)
+    if options.disturbances:
+        lanes = lanes[lanes["disturbance"].isin(options.disturbances)]
     if lanes.empty:
         print(f"nothing is trained in {options.run} yet")
         return 1
