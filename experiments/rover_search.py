@@ -122,6 +122,9 @@ CHANGES: tuple[dict, ...] = (
                     {"batch_size": 256},
                     # Twice the rows and twice the averaging do not help: it is not luck alone.
                     {"total_steps": 80_000},
+                    # What else could: wider exploration, a steadier critic and an actor after it.
+                    {"exploration_noise": 0.2},
+                    {"learning_rate": 1e-3},
                 )
             ),
         )
