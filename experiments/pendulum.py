@@ -89,12 +89,10 @@ def normalised(lanes: pd.DataFrame, column: str) -> pd.Series:
 
 
 def finals(run: pathlib.Path) -> pd.DataFrame:
-    """A row per lane: mean true-state return of the final episodes, and normalised; its size."""
+    """A row per lane: mean true-state return of the final episodes, and normalised."""
     lanes = seed_means(read_table(run / "episodes.parquet", EPISODES))
     lanes = lanes[lanes["algorithm"].isin(rtd.ALGORITHMS)].copy()
     lanes["normalised"] = normalised(lanes, "disturbance")
-    config = RunDirectory.open(run).cells[0].config
-    lanes = lanes.assign(steps=config.total_steps, width=config.hidden_size)
     return lanes.drop(columns="env").rename(columns={"true_return": "mean"})
 
 
@@ -177,7 +175,8 @@ def main(arguments: list[str] | None = None) -> int:
         options.steps, options.seeds, options.lengths, options.width = 40, 1, [1], 4
         more = ["--batch-size=4", "--learning-starts=10", "--eval-every=40", "--eval-episodes=1"]
         more += ["--final-episodes=1", "--quiet", "--no-report", "--algorithms", "td3"]
-        more += ["--disturbances", *(options.disturbances or ["random-sine"])]
+        if not options.disturbances:
+            more += ["--disturbances", "random-sine"]
         episodes = 2
     status = 0 if options.report else train(options.run, options, more)
     if status not in (0, 1):
@@ -188,9 +187,11 @@ def main(arguments: list[str] | None = None) -> int:
     if lanes.empty:
         print(f"nothing is trained in {options.run} yet")
         return 1
-    name, carried_from = "pendulum", lanes[lanes["disturbance"] == "random-sine"]
+    config = RunDirectory.open(options.run).cells[0].config
+    lanes = lanes.assign(steps=config.total_steps, width=config.hidden_size)
+    curves, carried_from = "pendulum", lanes[lanes["disturbance"] == "random-sine"]
     if options.disturbances:
-        name = f"pendulum_{options.steps}_steps"
+        curves = f"pendulum_{config.total_steps}_steps"
         lanes = with_others(lanes, options.out / "pendulum.parquet")
 
     def facts(lanes: pd.DataFrame) -> dict[str, object]:
@@ -201,14 +202,14 @@ def main(arguments: list[str] | None = None) -> int:
             lengths=sorted(int(length) for length in lanes["history_length"].unique()),
             steps=sizes(lanes, "steps"),
             width=sizes(lanes, "width"),
-            precision=RunDirectory.open(options.run).cells[0].config.precision,
+            precision=config.precision,
             minutes_of_the_last_call=round((time.time() - began) / 60, 1),
         )
 
     text = table(lanes, "disturbance", DISTURBANCES)
     write_results(options.out, "pendulum", lanes, text, facts(lanes))
     draw(lanes, options.out / "pendulum.png")
-    keep_curves(options.run, options.out, name)
+    keep_curves(options.run, options.out, curves)
     print(text)
     try:
         carried = generalisation(options.run, episodes)
