@@ -83,6 +83,18 @@ class Config:
     target_noise_clip: float = _field(
         0.5, "bound of target policy smoothing, in half ranges", traced=True, low=0
     )
+    actor_noise: float = _field(
+        0.0,
+        "standard deviation of the noise on the actions whose value the actor climbs, in half "
+        "ranges (TD3: 0); as wide as the exploration, the critic's kinks average out",
+        traced=True,
+        low=0,
+    )
+    update_every: int = _field(
+        1,
+        "environment steps per critic update (TD3: 1); with more, rewards' luck is fitted less",
+        low=1,
+    )
     policy_delay: int = _field(2, "critic updates per actor and target update", low=1)
     learning_starts: int = _field(
         1_000, "uniform-random steps before the first update; at least batch_size", low=1

@@ -38,6 +38,7 @@ class Hyperparameters:
     exploration_noise: jax.Array
     target_noise: jax.Array
     target_noise_clip: jax.Array
+    actor_noise: jax.Array
     history_length: jax.Array
 
     def at(self, progress: jax.Array) -> "Hyperparameters":
@@ -153,10 +154,21 @@ def critic_loss(critic: Params, variant: Variant, batch: Batch, y: jax.Array) ->
 
 
 def actor_loss(
-    actor: Params, critic: Params, variant: Variant, batch: Batch, bounds: Bounds
+    actor: Params,
+    critic: Params,
+    variant: Variant,
+    batch: Batch,
+    key: jax.Array,
+    noise: jax.Array,
+    bounds: Bounds,
 ) -> jax.Array:
-    """Minus the first critic's mean value of the actor's actions."""
-    action = act(actor, variant, batch.window, bounds)
+    """Minus the first critic's mean value of the actor's actions, averaged over noise on them.
+
+    With ``noise`` [] > 0 the actor climbs a smoothed action value (Nachum et al., 2018), by one draw
+    for each of the batch: a critic knows the value around where exploration went, while its slope
+    at a single action is mostly kinks. With 0 it is TD3's loss.
+    """
+    action = explore(key, act(actor, variant, batch.window, bounds), noise, bounds)
     carry = batch.carry
     if carry is None and variant.critic.memory:
         # No past token depends on the actor: the critic's prefix needs no tape.
@@ -191,11 +203,20 @@ def update_actor_and_targets(
     learner: Learner,
     variant: Variant,
     batch: Batch,
+    key: jax.Array,
     hyperparameters: Hyperparameters,
     bounds: Bounds,
 ) -> Learner:
     """One Adam step of the actor, then Polyak averaging of all targets."""
-    gradient = jax.grad(actor_loss)(learner.actor, learner.critics[0], variant, batch, bounds)
+    gradient = jax.grad(actor_loss)(
+        learner.actor,
+        learner.critics[0],
+        variant,
+        batch,
+        key,
+        hyperparameters.actor_noise,
+        bounds,
+    )
     actor, optimizer = _descend(
         learner.actor, gradient, learner.actor_optimizer, hyperparameters.actor_learning_rate
     )

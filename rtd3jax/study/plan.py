@@ -166,7 +166,7 @@ def estimate(jobs: Sequence[Job], workers: int) -> Cost:
 
 
 def update_flops(config: Config) -> float:
-    """Operations of the products of one environment step's updates, the delayed ones spread out.
+    """Operations of the products of an environment step's updates, those between steps spread out.
 
     A layer's backward pass costs two forward passes, one for its weights and one for what it sends
     back. A window's first token has no carry and so no recurrent product; nothing is sent back into
@@ -197,7 +197,7 @@ def update_flops(config: Config) -> float:
         to_action += 0.5 * token
     critics = forward(actor) + 2 * forward(critic) + 2 * (forward(critic) + backward(critic))
     delayed = forward(actor) + backward(actor) + forward(critic) + to_action
-    return critics + delayed / config.policy_delay
+    return (critics + delayed / config.policy_delay) / config.update_every
 
 
 def _matmul_rate(threads: int) -> float:

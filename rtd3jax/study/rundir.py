@@ -112,7 +112,7 @@ class RunDirectory:
             raise UserError(f"--out {self.path} cannot be written: {error.strerror}") from error
 
     def _check_same(self, config: Path) -> None:
-        study = _read_study(config)
+        study = _with_defaults(_read_study(config))
         if study != json.loads(json.dumps(self._study)):
             raise UserError(
                 f"--out {self.path} holds another study ({_difference(study, self._study)}); "
@@ -329,6 +329,15 @@ def _read_study(config: Path) -> Any:
         raise UserError(f"there is no study in {config.parent} ({error.strerror})") from error
     except (ValueError, KeyError, TypeError) as error:
         raise UserError(f"{config} is not a study's configuration") from error
+
+
+def _with_defaults(study: Any) -> Any:
+    """``study``, a field of the configuration that it was written without at its default."""
+    try:
+        cells = [Cell.from_dict(dict(cell)).to_dict() for cell in study["cells"]]
+    except (UserError, KeyError, TypeError, ValueError):
+        return study  # it is another study then, and the difference is named
+    return {**study, "cells": cells}
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:

@@ -252,8 +252,10 @@ class Program:
         """The step's updates, if it has any; the critics' loss."""
         config = self.config
         variant = VARIANTS[config.algorithm].at(config.precision)
-        sample_key, target_key = jax.random.split(key)
-        updates = step - config.learning_starts + 1
+        sample_key, target_key, actor_key = jax.random.split(key, 3)
+        since = step - config.learning_starts
+        due = (since >= 0) & (since % config.update_every == 0)
+        updates = since // config.update_every + 1
         numbers = numbers.at(step.astype(jnp.float32) / config.total_steps)
 
         def learn(learner):
@@ -263,14 +265,16 @@ class Program:
             learner, loss = update_critics(learner, variant, batch, target_key, numbers, bounds)
             learner = lax.cond(
                 updates % config.policy_delay == 0,
-                lambda before: update_actor_and_targets(before, variant, batch, numbers, bounds),
+                lambda before: update_actor_and_targets(
+                    before, variant, batch, actor_key, numbers, bounds
+                ),
                 lambda before: before,
                 learner,
             )
             return learner, loss
 
         # The step is common to all lanes, so that this stays a branch under vmap.
-        return lax.cond(updates > 0, learn, lambda same: (same, jnp.float32(0.0)), learner)
+        return lax.cond(due, learn, lambda same: (same, jnp.float32(0.0)), learner)
 
     def _keep_final_carry(
         self, replay, learner, window, action, final_observation, numbers, done, step

@@ -14,7 +14,7 @@ from rtd3jax.agents.windows import Steps, Window
 B, L, WIDTH, UPDATES = 8, 3, 8, 200
 BOUNDS = td3.Bounds(jnp.array([-2.0]), jnp.array([2.0]))
 NUMBERS = td3.Hyperparameters(
-    *(jnp.float32(x) for x in (1e-3, 1e-3, 1.0, 0.9, 1.0, 0.005, 0.1, 0.2, 0.5)),
+    *(jnp.float32(x) for x in (1e-3, 1e-3, 1.0, 0.9, 1.0, 0.005, 0.1, 0.2, 0.5, 0.0)),
     history_length=jnp.int32(L),
 )
 
@@ -80,7 +80,7 @@ def _straightforward(learner, variant, batch, key):
 
 def _fast(learner, variant, batch, key):
     learner, _ = td3.update_critics(learner, variant, batch, key, NUMBERS, BOUNDS)
-    return td3.update_actor_and_targets(learner, variant, batch, NUMBERS, BOUNDS)
+    return td3.update_actor_and_targets(learner, variant, batch, key, NUMBERS, BOUNDS)
 
 
 def _reference_lstm(params, inputs, exists, carry=None, precision="float32"):

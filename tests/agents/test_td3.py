@@ -27,6 +27,7 @@ def _numbers(**changes):
         exploration_noise=0.1,
         target_noise=0.2,
         target_noise_clip=0.3,
+        actor_noise=0.0,
     )
     values = {name: jnp.float32(value) for name, value in (numbers | changes).items()}
     return td3.Hyperparameters(**values, history_length=jnp.int32(L))
@@ -119,13 +120,41 @@ def test_the_actor_climbs_the_first_critic(problem):
         return -jnp.mean(apply_network(learner.critics[0], variant.critic, batch.window, action))
 
     value, gradient = jax.value_and_grad(td3.actor_loss)(
-        learner.actor, learner.critics[0], variant, batch, BOUNDS
+        learner.actor,
+        learner.critics[0],
+        variant,
+        batch,
+        jax.random.key(3),
+        jnp.float32(0.0),
+        BOUNDS,
     )
     expected, expected_gradient = jax.value_and_grad(loss)(learner.actor)
     np.testing.assert_allclose(value, expected, rtol=1e-5)
     assert np.any(expected_gradient["head"]["kernel"])
     for a, b in zip(*map(jax.tree.leaves, (gradient, expected_gradient)), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-6)
+
+
+def test_actor_noise_averages_the_value_over_the_actions_around(problem):
+    variant, learner, batch = problem
+    noise, draws = 0.3, 4_000
+    greedy = np.asarray(td3.act(learner.actor, variant, batch.window, BOUNDS))
+    around = np.random.default_rng(0).normal(size=(draws, B, 1)) * noise * 3.0
+    actions = jnp.asarray(np.clip(greedy[None] + around, -2.0, 4.0), jnp.float32)
+
+    def value(action):
+        return apply_network(learner.critics[0], variant.critic, batch.window, action)[:, 0]
+
+    expected = -np.asarray(jax.vmap(value)(actions)).mean()
+    keys = jax.random.split(jax.random.key(3), draws)
+    got = jax.vmap(
+        lambda key: td3.actor_loss(
+            learner.actor, learner.critics[0], variant, batch, key, jnp.float32(noise), BOUNDS
+        )
+    )(keys)
+    error = float(got.std()) / np.sqrt(draws)
+    assert abs(float(got.mean()) - expected) < 6 * error
+    assert abs(float(np.mean(value(jnp.asarray(greedy)))) + expected) > 12 * error
 
 
 def test_updates_are_adam_and_polyak(problem):
@@ -148,7 +177,9 @@ def test_updates_are_adam_and_polyak(problem):
     assert updated.actor is learner.actor and updated.target_critics is learner.target_critics
     assert float(loss) == pytest.approx(float(both(learner.critics)), rel=1e-6)
 
-    after = td3.update_actor_and_targets(updated, variant, batch, _numbers(), BOUNDS)
+    after = td3.update_actor_and_targets(
+        updated, variant, batch, jax.random.key(3), _numbers(), BOUNDS
+    )
     triples = (
         (after.actor, learner.target_actor, after.target_actor),
         (updated.critics, learner.target_critics, after.target_critics),
@@ -174,3 +205,20 @@ def test_learning_rates_fall_linearly_to_their_final_fraction():
         np.testing.assert_allclose(now.actor_learning_rate, 1e-2 * share, rtol=1e-6)
         np.testing.assert_allclose(now.critic_learning_rate, 2e-2 * share, rtol=1e-6)
     assert float(now.gamma) == float(numbers.gamma)
+
+
+def test_actor_noise_reaches_the_actor_alone(problem):
+    variant, learner, batch = problem
+    still, smoothed, again = (
+        td3.update_actor_and_targets(
+            learner, variant, batch, jax.random.key(3), _numbers(actor_noise=noise), BOUNDS
+        )
+        for noise in (0.0, 0.5, 0.5)
+    )
+    kernels = [after.actor["head"]["kernel"] for after in (still, smoothed, again)]
+    assert not np.allclose(kernels[0], kernels[1])
+    np.testing.assert_array_equal(kernels[1], kernels[2])
+    for a, b in zip(
+        *map(jax.tree.leaves, (still.target_critics, smoothed.target_critics)), strict=True
+    ):
+        np.testing.assert_array_equal(a, b)

@@ -31,6 +31,7 @@ HYPERPARAMETERS = dict(
     exploration_noise=0.1,
     target_noise=0.4,
     target_noise_clip=0.3,
+    actor_noise=0.0,
 )
 
 
@@ -179,7 +180,7 @@ def _update(variant, before, batch):
     gaussian = jax.random.normal(key, (len(NUMBERS), A), jnp.float32)
     y = td3.target(before, variant, batch, key, numbers, BOUNDS)
     after, loss = td3.update_critics(before, variant, batch, key, numbers, BOUNDS)
-    after = td3.update_actor_and_targets(after, variant, batch, numbers, BOUNDS)
+    after = td3.update_actor_and_targets(after, variant, batch, key, numbers, BOUNDS)
     return y, loss, after, gaussian
 
 

@@ -48,7 +48,8 @@ def _counted(algorithm, length, width, batch_size):
         return td3.update_critics(learner, variant, batch, key, numbers, bounds)
 
     def actor(learner, batch):
-        return td3.update_actor_and_targets(learner, variant, batch, numbers, bounds)
+        key = jax.random.key(0)
+        return td3.update_actor_and_targets(learner, variant, batch, key, numbers, bounds)
 
     count = [
         jax.jit(update).lower(*jax.eval_shape(inputs)).cost_analysis()["flops"]

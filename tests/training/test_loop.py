@@ -1,5 +1,7 @@
 """What a lane stores as it goes: boundaries, final observations, carries."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -111,3 +113,31 @@ def test_stored_carries_are_the_actors_own(lane):
 
 def test_the_last_evaluation_is_at_the_end(lane):
     assert np.isfinite(np.asarray(lane[2].returns)).all() and lane[0].evaluations == 1
+
+
+@pytest.mark.parametrize("update_every, critic, actor", [(1, 11, 5), (4, 3, 1)])
+def test_updates_come_every_so_many_steps_after_the_random_ones(update_every, critic, actor):
+    config = Config(
+        algorithm="td3",
+        total_steps=20,
+        hidden_size=32,
+        batch_size=4,
+        learning_starts=9,  # steps 9 to 19 may learn
+        update_every=update_every,
+        eval_every=20,
+        eval_episodes=1,
+    )
+    env = Clock()
+    program = make_program(env, config, 2, (1,))
+
+    def trained(**changes):
+        lane = make_lane(dataclasses.replace(config, **changes), 0, env.default_params)
+        advance = jax.jit(program.advance)
+        return advance(lane, program.init(lane), jnp.int32(0), jnp.int32(20)).learner
+
+    learner, smoothed = trained(), trained(actor_noise=0.5)
+    assert int(learner.critic_optimizer.count) == critic
+    assert int(learner.actor_optimizer.count) == actor
+    # The number that a configuration gives reaches the updates.
+    gradients = [one.actor_optimizer.mu["head"]["kernel"] for one in (learner, smoothed)]
+    assert not np.array_equal(*gradients)
