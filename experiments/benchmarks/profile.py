@@ -108,8 +108,8 @@ def own_times(events: list[dict], purpose_of: dict[str, str]) -> collections.Cou
     return total
 
 
-def report(lanes: Lanes, title: str, least: float, watched: float) -> str:
-    """The table of one program."""
+def watch(lanes: Lanes, least: float, watched: float) -> tuple[dict[str, float], float]:
+    """Microseconds of a core for a lane's step: of each purpose, and of a whole step unwatched."""
     lanes.warm_up(least)
     steps, took = lanes.run(least)
     unwatched = 1e6 * took * len(workers()) / steps
@@ -119,13 +119,16 @@ def report(lanes: Lanes, title: str, least: float, watched: float) -> str:
             steps, _ = lanes.run(watched)
         (path,) = pathlib.Path(folder).rglob("*.trace.json.gz")
         events = json.loads(gzip.decompress(path.read_bytes()))["traceEvents"]
-    times = own_times(events, purpose_of)
+    times = own_times(events, purpose_of).most_common()
+    return {purpose: time / steps for purpose, time in times}, unwatched
+
+
+def report(lanes: Lanes, title: str, least: float, watched: float) -> str:
+    """The table of one program."""
+    times, unwatched = watch(lanes, least, watched)
     total = sum(times.values())
-    body = [
-        [purpose, f"{time / steps:.0f}", f"{time / total:.2f}"]
-        for purpose, time in times.most_common()
-    ]
-    body.append(["**together**", f"**{total / steps:.0f}**", "**1.00**"])
+    body = [[purpose, f"{time:.0f}", f"{time / total:.2f}"] for purpose, time in times.items()]
+    body.append(["**together**", f"**{total:.0f}**", "**1.00**"])
     # More than together: threads waited, or helped with a product, which leaves no event.
     body.append(["a step unwatched", f"{unwatched:.0f}", ""])
     return f"## {title}\n\n{markdown_table(['purpose', 'µs of a core', 'share'], body)}\n"

@@ -6,6 +6,8 @@ import pathlib
 import re
 import runpy
 
+import pandas as pd
+
 ROOT = pathlib.Path(__file__).parents[2]
 
 
@@ -51,3 +53,35 @@ def test_the_guide_shows_the_measured_table():
     table = "".join(line for line in measured.splitlines(True) if line.startswith("|"))
     guide = (ROOT / "docs" / "deploy_a_policy.md").read_text()
     assert table in guide, "copy the table of latency.md to docs/deploy_a_policy.md"
+
+
+def test_bounds(tmp_path, capsys):
+    bounds = importlib.import_module("experiments.benchmarks.bounds")
+    report = importlib.import_module("experiments.benchmarks.report")
+    arguments = ["--quick", "--lengths", "1", "--out", str(tmp_path)]
+    assert bounds.main(arguments) == 2
+    assert "run python -m experiments.benchmarks.bench first" in capsys.readouterr().err
+
+    values = {report.ours("float32"): 400.0, report.PROCESS_PER_CORE: 200.0, report.SGEMM: 4e11}
+    rows = [(bounds.AGENT, 1, name, 0, value, "another") for name, value in values.items()]
+    path = tmp_path / "measurements.csv"
+    pd.DataFrame(rows, columns=report.COLUMNS).to_csv(path, index=False)
+    assert bounds.main(arguments) == 2
+    assert "another machine (another)" in capsys.readouterr().err
+
+    own = [(*row[:-1], bounds.machine()) for row in rows]
+    pd.DataFrame(own, columns=report.COLUMNS).to_csv(path, index=False)
+    assert bounds.main(arguments) == 0
+    (row,) = pd.read_csv(tmp_path / "bounds.csv").to_dict("records")
+    assert row["ratio"] == 2.0 and row["torch"] == 5.0
+    assert min(row[part] for part in ("products", "gates", "optimisers")) > 0
+    assert "| geometric mean |" in (tmp_path / "bounds.md").read_text()
+    assert bounds.main([*arguments, "--lengths", "3"]) == 2
+    assert "l = 3 has no measurements" in capsys.readouterr().err
+
+
+def test_a_bound_is_what_products_gates_and_optimisers_leave():
+    bounds = importlib.import_module("experiments.benchmarks.bounds")
+    parts = {"products": 1.0, "gates": 0.5, "optimisers": 0.25}
+    known = {"torch": 3.5, "large": 1e12}
+    assert bounds.bound(parts, known, 7e8) == {"ratio_bound": 2.0, "share_bound": 0.4}
