@@ -5,8 +5,9 @@ Usage: python experiments/rover.py [--quick] [--run DIR] [--out DIR] [--steps N]
 Trains six agents under three slips, five seeds each, in a run directory of the sweep; the same
 command goes on with what is missing. Then evaluates every policy there is under the processes of
 the paper's table. Writes rover.md, rover.parquet (a row per policy and process), rover.png and the
-learning curves. `--report` only evaluates. One setting for all agents: experiments/rover_search.py
-found it on seeds that are not among the five.
+learning curves. `--report` only evaluates what the table lacks; rows of an earlier setting stay,
+and are marked, where nothing was trained with this one. One setting for all agents:
+experiments/rover_search.py found it on seeds that are not among the five.
 """
 
 import argparse
@@ -32,13 +33,16 @@ from writing import (  # noqa: E402
     write_results,
 )
 
-STEPS = 40_000
+STEPS = 80_000
 SETTINGS = {
     "gamma": 0.0,
     "reward_scale": 10.0,
     "critic_learning_rate": 3e-3,
-    "actor_learning_rate": 3e-4,
+    "actor_learning_rate": 3e-3,
     "final_learning_rate_fraction": 0.0,
+    "actor_noise": 0.1,
+    "update_every": 4,
+    "eval_every": 2_000,
     "precision": "float32",
 }
 HISTORY_LENGTH = 1
@@ -87,22 +91,39 @@ def train(run: pathlib.Path, steps: int, more: list[str]) -> int:
     )
 
 
-def evaluate_policies(run: pathlib.Path, episodes: int, known: pd.DataFrame | None):
-    """A row per lane and process: mean over ``episodes`` and over the paper's twenty."""
-    rows, missing = [] if known is None else known.to_dict("records"), []
-    there = {(r["algorithm"], r["trained_on"], r["tested_on"], r["seed"]) for r in rows}
+def setting_text(steps: int) -> str:
+    """The setting of a run's rows, as the sweep's flags."""
+    return " ".join(flags({**SETTINGS, "total_steps": steps}))
+
+
+def evaluate_policies(run: pathlib.Path, episodes: int, known: pd.DataFrame | None, setting: str):
+    """A row per lane and process: mean over ``episodes`` and over the paper's twenty.
+
+    Rows of ``known`` stay: those of this setting are not evaluated again, those of another one
+    stand where the run has no policy.
+    """
+    rows, missing = [], []
+    names = ["trained_on", "tested_on", "algorithm", "seed"]
+    there = (
+        {} if known is None else {tuple(r[n] for n in names): r for r in known.to_dict("records")}
+    )
     for trained, tested in COLUMNS:
         env = rtd.make("rover", tested)
         for algorithm in rtd.ALGORITHMS:
             for seed in range(SEEDS):
-                if (algorithm, trained, tested, seed) in there:
+                row = there.get((trained, tested, algorithm, seed))
+                if row is not None and row["setting"] == setting:
+                    rows.append(row)
                     continue
                 try:
                     policy = rtd.load_policy(
                         run, algorithm=algorithm, disturbance=trained, seed=seed
                     )
                 except rtd.UserError as error:
-                    missing.append(str(error))
+                    if row is None:
+                        missing.append(str(error))
+                    else:
+                        rows.append(row)
                     continue
                 returns = np.asarray(rtd.evaluate(policy, env, episodes, seed=seed))
                 rows.append(
@@ -115,6 +136,7 @@ def evaluate_policies(run: pathlib.Path, episodes: int, known: pd.DataFrame | No
                         "mean": float(returns.mean()),
                         "standard_error": float(returns.std(ddof=1) / np.sqrt(episodes)),
                         "mean_of_20": float(returns[:PAPER_EPISODES].mean()),
+                        "setting": setting,
                     }
                 )
     return pd.DataFrame(rows), sorted(set(missing))
@@ -148,14 +170,16 @@ def pick(rows: pd.DataFrame, algorithm: str, trained: str, tested: str) -> pd.Da
     ]
 
 
-def spread(values: pd.Series) -> str:
+def spread(here: pd.DataFrame, setting: str) -> str:
     """Mean ± standard deviation over seeds; with how many, where some are missing."""
+    values = here["mean"]
     count = "" if len(values) == SEEDS else f" ({len(values)} of {SEEDS} seeds)"
     deviation = f" ± {values.std(ddof=1):.2f}" if len(values) > 1 else ""
-    return f"{values.mean():.2f}{deviation}{count}"
+    mark = "" if (here["setting"] == setting).all() else " †"
+    return f"{values.mean():.2f}{deviation}{count}{mark}"
 
 
-def table(rows: pd.DataFrame, others: dict[str, dict[str, str]]) -> str:
+def table(rows: pd.DataFrame, others: dict[str, dict[str, str]], setting: str) -> str:
     """The paper's two rover tables as one, our numbers above the paper's."""
     header = ["agent", *(f"{trained} → {tested}" for trained, tested in COLUMNS)]
     body = []
@@ -163,11 +187,12 @@ def table(rows: pd.DataFrame, others: dict[str, dict[str, str]]) -> str:
         mine = [f"**{algorithm}**"]
         for trained, tested in COLUMNS:
             here = pick(rows, algorithm, trained, tested)
-            mine.append(spread(here["mean"]) if len(here) else "not trained yet")
+            mine.append(spread(here, setting) if len(here) else "not trained yet")
         body += [mine, ["paper", *PAPER[algorithm]]]
     for name, values in others.items():
         body.append([f"*{name}*", *(values[tested] for _, tested in COLUMNS)])
-    return markdown_table(header, body)
+    notes = [f"\n† trained with {other}" for other in sorted({*rows["setting"]} - {setting})]
+    return "\n".join([markdown_table(header, body), *notes])
 
 
 def draw(rows: pd.DataFrame, path: pathlib.Path) -> None:
@@ -213,7 +238,8 @@ def main(arguments: list[str] | None = None) -> int:
         return status
     kept = options.out / "rover.parquet"
     known = pd.read_parquet(kept) if options.report and kept.exists() else None
-    rows, missing = evaluate_policies(options.run, episodes, known)
+    setting = setting_text(steps)
+    rows, missing = evaluate_policies(options.run, episodes, known, setting)
     if rows.empty:
         print(f"nothing is trained in {options.run} yet")
         return 1
@@ -227,7 +253,7 @@ def main(arguments: list[str] | None = None) -> int:
         missing=len(missing),
         minutes_of_the_last_call=round((time.time() - began) / 60, 1),
     )
-    text = table(rows, references(episodes))
+    text = table(rows, references(episodes), setting)
     write_results(options.out, "rover", rows, text, facts)
     draw(rows, options.out / "rover.png")
     keep_curves(options.run, options.out, "rover")
