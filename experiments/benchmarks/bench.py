@@ -260,13 +260,22 @@ def _numpy_sgemm(size: int, seconds: float) -> tuple[float, float]:
 
 
 def machine() -> str:
-    """Processor and cores, by which results of different machines are kept apart."""
+    """Processor and cores, by which results of different machines are kept apart.
+
+    With the processor's family and model where there are any: a virtual machine's name hides them.
+    """
     try:
         lines = pathlib.Path("/proc/cpuinfo").read_text().splitlines()
-        names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     except OSError:
-        names = []
-    return f"{(names or ['unknown processor'])[0]}, {len(workers())} cores"
+        lines = []
+    # The first processor's; the others are alike.
+    facts = {
+        name.strip(): value.strip() for name, _, value in (x.partition(":") for x in lines[::-1])
+    }
+    name = facts.get("model name", "unknown processor")
+    if "cpu family" in facts and "model" in facts:
+        name += f" (family {facts['cpu family']}, model {facts['model']})"
+    return f"{name}, {len(workers())} cores"
 
 
 def _put_aside(path: pathlib.Path) -> None:

@@ -59,6 +59,7 @@ NUMBERS = [
 OTHERS = {
     "--disturbances": ["none"],
     "--policy-delay": ["2"],
+    "--update-every": ["3", "0"],
     "--checkpoint-every": ["5m", "3steps", "1s", "0s", "5x", "-1", "99999999999h", ""],
     "--shard": ["1/1", "1/2", "2/2", "3/2", "0/0", "a/b", "1/99999999"],
     "--strategy": ["map", "nap"],
