@@ -11,6 +11,7 @@ experiments/rover_search.py found it on seeds that are not among the five.
 """
 
 import argparse
+import itertools
 import pathlib
 import sys
 import time
@@ -25,6 +26,7 @@ import rtd3jax as rtd
 from rtd3jax import sweep
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
+from claims import Effect  # noqa: E402
 from writing import (  # noqa: E402
     RESULTS,
     keep_curves,
@@ -195,6 +197,19 @@ def table(rows: pd.DataFrame, others: dict[str, dict[str, str]], setting: str) -
     return "\n".join([markdown_table(header, body), *notes])
 
 
+def order(rows: pd.DataFrame) -> str:
+    """The paper's order of the agents on AR(1) slip, pair by pair, and whether it held."""
+    header = ["trained on", "the paper's order: difference of means [95% interval]", "verdict"]
+    body = []
+    for column, (trained, tested) in list(enumerate(COLUMNS))[:2]:
+        ranked = sorted(PAPER, key=lambda name, k=column: -float(PAPER[name][k].split()[0]))
+        for better, worse in itertools.pairwise(ranked):
+            sides = (pick(rows, name, trained, tested)["mean"] for name in (better, worse))
+            effect = Effect(f"{better} over {worse}", *(side.to_numpy() for side in sides))
+            body.append([trained, effect.text(), effect.verdict()])
+    return markdown_table(header, body)
+
+
 def draw(rows: pd.DataFrame, path: pathlib.Path) -> None:
     """The transfer matrix: mean return of each agent (rows) in each column."""
     grid = np.full((len(rtd.ALGORITHMS), len(COLUMNS)), np.nan)
@@ -253,7 +268,7 @@ def main(arguments: list[str] | None = None) -> int:
         missing=len(missing),
         minutes_of_the_last_call=round((time.time() - began) / 60, 1),
     )
-    text = table(rows, references(episodes), setting)
+    text = "\n\n".join([table(rows, references(episodes), setting), order(rows)])
     write_results(options.out, "rover", rows, text, facts)
     draw(rows, options.out / "rover.png")
     keep_curves(options.run, options.out, "rover")
