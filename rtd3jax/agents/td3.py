@@ -164,9 +164,9 @@ def actor_loss(
 ) -> jax.Array:
     """Minus the first critic's mean value of the actor's actions, averaged over noise on them.
 
-    With ``noise`` [] > 0 the actor climbs a smoothed action value (Nachum et al., 2018), by one draw
-    for each of the batch: a critic knows the value around where exploration went, while its slope
-    at a single action is mostly kinks. With 0 it is TD3's loss.
+    With ``noise`` [] > 0 the actor climbs a smoothed action value (Nachum et al., 2018), by one
+    draw for each of the batch: a critic knows the value around where exploration went, while its
+    slope at a single action is mostly kinks. With 0 it is TD3's loss.
     """
     action = explore(key, act(actor, variant, batch.window, bounds), noise, bounds)
     carry = batch.carry
