@@ -19,7 +19,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from rtd3jax.study.results import REFERENCES, write_bytes_atomically
-from rtd3jax.study.statistics import seed_means, summarise
+from rtd3jax.study.statistics import iqm_bands, seed_means, summarise
 
 # Colours that remain apart for colour-blind readers: the palette of Okabe and Ito, "Color
 # Universal Design", 2008. The order is that of legends and axes.
@@ -70,15 +70,15 @@ def learning_curves(
     directory: str | Path,
     ceilings: Ceilings | None = None,
 ) -> list[Path]:
-    """Draw mean return against environment steps; return the paths of the PNG and the SVG.
+    """Draw return against environment steps; return the paths of the PNG and the SVG.
 
     ``curves`` has the columns of CURVES; ``references`` those of EPISODES, of which only the
     reference policies are used; ``ceilings`` are drawn where they are known. One panel per
-    disturbance (rows) and history length (columns); a line is the mean over the seeds with a finite
-    value at that step, its band one standard deviation (ddof 1) either side.
+    disturbance (rows) and history length (columns); a line is the interquartile mean (IQM) over the
+    seeds with a finite value at that step, its band the 95% bootstrap interval of it.
 
     The panels of a row share their y-limits: from the lower quartile of all lower band edges
-    (or the lowest final mean, if lower, so that no line ends outside) to the highest upper edge.
+    (or the lowest final IQM, if lower, so that no line ends outside) to the highest upper edge.
     Very bad returns early in training thus leave the panel instead of squashing the rest.
     """
     with mpl.rc_context(_STYLE):
@@ -94,7 +94,7 @@ def learning_curves(
         for axes in grid[-1]:
             axes.set_xlabel("environment steps")
         for axes in grid[:, 0]:
-            axes.set_ylabel("mean return")
+            axes.set_ylabel("return")
         handles = [
             Line2D([], [], color=colour_of(name), linewidth=1.8, label=name)
             for name in ordered(curves["algorithm"])
@@ -163,15 +163,15 @@ def _curve_row(
             line = of_task[of_task["algorithm"] == name]
             if name != WINDOWLESS:
                 line = line[line["history_length"] == length]
-            steps, mean, std = _band(line)
+            steps, iqm, low, high = _band(line)
             if steps.size == 0:
                 continue
             colour = colour_of(name)
-            axes.plot(steps, mean, color=colour, linewidth=1.6, label=name, zorder=3)
-            axes.fill_between(steps, mean - std, mean + std, color=colour, alpha=0.15, linewidth=0)
-            lower.append(mean - std)
-            upper.append(mean + std)
-            final.append(mean[-1])
+            axes.plot(steps, iqm, color=colour, linewidth=1.6, label=name, zorder=3)
+            axes.fill_between(steps, low, high, color=colour, alpha=0.15, linewidth=0)
+            lower.append(low)
+            upper.append(high)
+            final.append(iqm[-1])
     edges = np.array([])
     if lower:
         bottom = min(np.quantile(np.concatenate(lower), CLIPPED_SHARE), min(final))
@@ -180,15 +180,16 @@ def _curve_row(
         _fit(axes, edges, means)
 
 
-def _band(line: pd.DataFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Steps, mean and standard deviation over seeds [evaluations]; steps without values left out.
+def _band(line: pd.DataFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Steps, IQM over seeds and the bounds of its interval [evaluations], as on a run's page.
 
-    A single seed has standard deviation 0 here: its line is drawn without a band.
+    Steps without values are left out. The bounds of a single seed are its line.
     """
-    values = line["return"].astype(np.float64)
-    values = values[np.isfinite(values)].groupby(line["step"], sort=True)
-    mean, std = values.mean(), values.std(ddof=1).fillna(0.0)
-    return mean.index.to_numpy(), mean.to_numpy(), std.to_numpy()
+    table = line.pivot_table(index="seed", columns="step", values="return", aggfunc="mean")
+    count, iqm, low, high = iqm_bands(table.to_numpy(np.float64))
+    steps, seen = table.columns.to_numpy(), count > 0
+    low, high = (np.where(count > 1, bound, iqm) for bound in (low, high))
+    return steps[seen], iqm[seen], low[seen], high[seen]
 
 
 def _final_panel(
