@@ -177,7 +177,8 @@ def spread(here: pd.DataFrame, setting: str) -> str:
     values = here["mean"]
     count = "" if len(values) == SEEDS else f" ({len(values)} of {SEEDS} seeds)"
     deviation = f" ± {values.std(ddof=1):.2f}" if len(values) > 1 else ""
-    mark = "" if (here["setting"] == setting).all() else " †"
+    older = int((here["setting"] != setting).sum())
+    mark = "" if not older else " †" if older == len(here) else f" († {older} of {len(here)})"
     return f"{values.mean():.2f}{deviation}{count}{mark}"
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.benchmarks import products, profile, report
-from experiments.benchmarks.bench import LENGTHS, machine
+from experiments.benchmarks.bench import LENGTHS, QUICK, Measurements, Sizes, machine
 from experiments.benchmarks.ours import Lanes, make_config
 from rtd3jax.errors import UserError
 from rtd3jax.training.lanes import workers
@@ -29,10 +29,11 @@ from writing import RESULTS, markdown_table  # noqa: E402
 AGENT = products.AGENT
 
 
-def measure(length: int, quick: bool) -> dict[str, float]:
+def measure(length: int, sizes: Sizes) -> dict[str, float]:
     """Milliseconds for a seed-step of all cores together, by part."""
-    cores = len(workers())
-    batch, width, least, rounds = (4, 8, 1e-4, 1) if quick else (100, 128, 0.2, 3)
+    cores, quick = len(workers()), sizes is QUICK
+    batch, width = sizes.batch_size, sizes.hidden_size
+    least, rounds = (1e-4, 1) if quick else (0.2, 3)
     alone = sum(
         product.count * products.seconds(product, least, rounds, cores)
         for product in products.products_of(length, batch, width)
@@ -55,7 +56,7 @@ def beside(measured: report.Table, length: int) -> dict[str, float]:
     if theirs is None or large is None or now is None or share is None:
         raise UserError(
             f"{AGENT} at l = {length} has no measurements beside PyTorch in --out; run "
-            "python -m experiments.benchmarks.bench there first"
+            "python -m experiments.benchmarks.bench first"
         )
     return {
         "torch": float(1e3 / np.median(theirs[1])),
@@ -95,15 +96,17 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--lengths", type=int, nargs="+", default=list(LENGTHS))
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS / "benchmarks")
     options = parser.parse_args(arguments)
+    sizes = QUICK if options.quick else Sizes()
     try:
-        measured = _measured(options.out / "measurements.csv")
+        there = Measurements(options.out / "measurements.csv", fresh=False, machine=machine())
+        measured = report.Table(there.table, sizes.hidden_size, sizes.batch_size)
         found = {length: beside(measured, length) for length in options.lengths}
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     rows = []
     for length, known in found.items():
-        parts = measure(length, options.quick)
+        parts = measure(length, sizes)
         rows.append({**parts, **known, **bound(parts, known, measured.flops(AGENT, length))})
     table = pd.DataFrame(rows)
     table.round(4).to_csv(options.out / "bounds.csv", index=False)
@@ -113,17 +116,6 @@ def main(arguments: list[str] | None = None) -> int:
     (options.out / "bounds.md").write_text(text)
     print(text)
     return 0
-
-
-def _measured(path: pathlib.Path) -> report.Table:
-    """The benchmark's measurements, which must be this machine's."""
-    if not path.exists():
-        raise UserError(f"{path} is not there; run python -m experiments.benchmarks.bench first")
-    rows = pd.read_csv(path)
-    others = set(rows["machine"]) - {machine()}
-    if others:
-        raise UserError(f"{path} was measured on another machine ({others.pop()})")
-    return report.Table(rows, 128, 100)
 
 
 if __name__ == "__main__":

@@ -185,7 +185,7 @@ def _band(line: pd.DataFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nd
 
     Steps without values are left out. The bounds of a single seed are its line.
     """
-    table = line.pivot_table(index="seed", columns="step", values="return", aggfunc="mean")
+    table = line.pivot(index="seed", columns="step", values="return")
     count, iqm, low, high = iqm_bands(table.to_numpy(np.float64))
     steps, seen = table.columns.to_numpy(), count > 0
     low, high = (np.where(count > 1, bound, iqm) for bound in (low, high))
