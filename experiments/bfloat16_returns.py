@@ -22,7 +22,8 @@ from rtd3jax import sweep
 from rtd3jax.study.rundir import RunDirectory
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-from rover import EPISODES, HISTORY_LENGTH, SEEDS, SETTINGS, STEPS, flags  # noqa: E402
+from rover import EPISODES, HISTORY_LENGTH, SEEDS, SETTINGS, STEPS  # noqa: E402
+from settings import flags  # noqa: E402
 from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
 
 AGENT, DISTURBANCE = "lstm-td3-1ha1hc", "ar1-slip"

@@ -11,6 +11,10 @@ conditions, 1,000 episodes each. Writes pendulum.md, .parquet and .png, the lear
 generalisation.md and .parquet. The paper has five seeds, lengths 1 to 20 and width 128; the table
 says what was run. `--report` does not train.
 
+One setting for all agents: experiments/pendulum_search.py found it on seeds that are not reported,
+under `hidden`. With `--disturbances` the rows of others stay as they are; those of an earlier
+setting are marked.
+
 Returns are normalised: 0 is the uniform-random policy, 1 the fully observed optimum.
 """
 
@@ -35,6 +39,7 @@ from rtd3jax.study.statistics import seed_means
 from rtd3jax.study.transfer import transfer
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
+from settings import flags, setting_text  # noqa: E402
 from writing import (  # noqa: E402
     RESULTS,
     keep_curves,
@@ -55,6 +60,15 @@ CONDITIONS = (
     "noise:sigma=1.0",
 )
 """Under which agents of `random-sine` are tested (the paper's generalisation figure)."""
+SETTINGS = {
+    "critic_learning_rate": 3e-3,
+    "actor_learning_rate": 3e-4,
+    "final_learning_rate_fraction": 0.0,
+    "gamma": 0.97,
+    "reward_scale": 0.1,
+    "exploration_noise": 0.5,
+    "replay_capacity": 10_000,
+}
 GENERALISATION_EPISODES = 1_000
 REFERENCE_EPISODES = 1_000
 
@@ -68,7 +82,7 @@ def train(run: pathlib.Path, options: argparse.Namespace, more: list[str]) -> in
         [
             *("--preset", "pendulum", "--history-lengths", *lengths, "--out", str(run)),
             *("--seeds", str(options.seeds), "--total-steps", str(options.steps)),
-            *("--hidden-size", str(options.width), *more),
+            *("--hidden-size", str(options.width), *flags(SETTINGS), *more),
         ]
     )
 
@@ -101,12 +115,14 @@ def with_others(lanes: pd.DataFrame, path: pathlib.Path) -> pd.DataFrame:
     if not path.exists():
         return lanes
     kept = pd.read_parquet(path)
+    if "setting" not in kept:
+        kept["setting"] = "the configuration's defaults"  # as all tables were, when none was noted
     return pd.concat([lanes, kept[~kept["disturbance"].isin(lanes["disturbance"])]])
 
 
-def sizes(lanes: pd.DataFrame, column: str) -> dict[str, int]:
-    """``steps`` or ``width`` of each disturbance."""
-    return {name: int(own[column].iloc[0]) for name, own in lanes.groupby("disturbance")}
+def of_each(lanes: pd.DataFrame, column: str) -> dict[str, object]:
+    """``steps``, ``width`` or ``setting`` of each disturbance."""
+    return {name: own[column].tolist()[0] for name, own in lanes.groupby("disturbance")}
 
 
 def generalisation(run: pathlib.Path, episodes: int) -> pd.DataFrame:
@@ -121,7 +137,12 @@ def generalisation(run: pathlib.Path, episodes: int) -> pd.DataFrame:
 
 
 def table(lanes: pd.DataFrame, column: str, names: tuple[str, ...]) -> str:
-    """Agents and lengths down, disturbances across: mean normalised return ± std over seeds."""
+    """Agents and lengths down, disturbances across: mean normalised return ± std over seeds.
+
+    Columns that were trained with an earlier setting are marked.
+    """
+    older = lanes[lanes["setting"] != setting_text(SETTINGS)]
+    header = [f"{name} †" if (older[column] == name).any() else name for name in names]
     body = []
     for algorithm in rtd.ALGORITHMS:
         own = lanes[lanes["algorithm"] == algorithm]
@@ -132,7 +153,8 @@ def table(lanes: pd.DataFrame, column: str, names: tuple[str, ...]) -> str:
                 spread = f" ± {here.std(ddof=1):.3f}" if len(here) > 1 else ""
                 line.append(f"{here.mean():.3f}{spread}" if len(here) else "not run")
             body.append(line)
-    return markdown_table(["agent", "l", *names], body)
+    notes = [f"\n† trained with {text}" for text in sorted({*older["setting"]})]
+    return "\n".join([markdown_table(["agent", "l", *header], body), *notes])
 
 
 def draw(lanes: pd.DataFrame, path: pathlib.Path) -> None:
@@ -152,7 +174,7 @@ def draw(lanes: pd.DataFrame, path: pathlib.Path) -> None:
                 axes.plot(x, values.mean(), "_", ms=9, mew=2, color=COLOURS[algorithm])
         axes.axhline(1.0, color="#777777", lw=0.8)
         axes.set_xticks(range(len(rtd.ALGORITHMS)), rtd.ALGORITHMS, rotation=60, ha="right")
-        axes.set_title(f"{name}\n{sizes(here, 'steps')[name]:,} steps", fontsize=10)
+        axes.set_title(f"{name}\n{of_each(here, 'steps')[name]:,} steps", fontsize=10)
         axes.grid(axis="y", color="#E4E4E4", lw=0.6)
     panels[0].set_ylabel("normalised return")
     figure.savefig(path, dpi=150)
@@ -188,7 +210,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"nothing is trained in {options.run} yet")
         return 1
     config = RunDirectory.open(options.run).cells[0].config
-    lanes = lanes.assign(steps=config.total_steps, width=config.hidden_size)
+    setting = setting_text({name: getattr(config, name) for name in SETTINGS})
+    lanes = lanes.assign(steps=config.total_steps, width=config.hidden_size, setting=setting)
     curves, carried_from = "pendulum", lanes[lanes["disturbance"] == "random-sine"]
     if options.disturbances:
         curves = f"pendulum_{config.total_steps}_steps"
@@ -198,10 +221,11 @@ def main(arguments: list[str] | None = None) -> int:
         return provenance(
             normalised="0 is the uniform-random policy, 1 the fully observed optimum",
             lanes=len(lanes),
-            seeds=sorted(int(seed) for seed in lanes["seed"].unique()),
+            seeds={name: own["seed"].nunique() for name, own in lanes.groupby("disturbance")},
             lengths=sorted(int(length) for length in lanes["history_length"].unique()),
-            steps=sizes(lanes, "steps"),
-            width=sizes(lanes, "width"),
+            steps=of_each(lanes, "steps"),
+            width=of_each(lanes, "width"),
+            setting=of_each(lanes, "setting"),
             precision=config.precision,
             minutes_of_the_last_call=round((time.time() - began) / 60, 1),
         )
@@ -212,7 +236,7 @@ def main(arguments: list[str] | None = None) -> int:
     keep_curves(options.run, options.out, curves)
     print(text)
     try:
-        carried = generalisation(options.run, episodes)
+        carried = generalisation(options.run, episodes).assign(setting=setting)
     except UserError as error:
         print(f"missing: generalisation: {error}")
         return 0

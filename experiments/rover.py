@@ -27,6 +27,7 @@ from rtd3jax import sweep
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from claims import Effect  # noqa: E402
+from settings import flags, setting_text  # noqa: E402
 from writing import (  # noqa: E402
     RESULTS,
     keep_curves,
@@ -76,11 +77,6 @@ PAPER = {
 """Mean ± standard deviation over five seeds (Omi et al., the rover's two tables)."""
 
 
-def flags(settings: dict[str, object]) -> list[str]:
-    """Fields of the configuration, for the sweep's command line."""
-    return [f"--{name.replace('_', '-')}={value}" for name, value in settings.items()]
-
-
 def train(run: pathlib.Path, steps: int, more: list[str]) -> int:
     """Train what is missing; the sweep's exit status."""
     return sweep.main(
@@ -91,11 +87,6 @@ def train(run: pathlib.Path, steps: int, more: list[str]) -> int:
             *more,
         ]
     )
-
-
-def setting_text(steps: int) -> str:
-    """The setting of a run's rows, as the sweep's flags."""
-    return " ".join(flags({**SETTINGS, "total_steps": steps}))
 
 
 def evaluate_policies(run: pathlib.Path, episodes: int, known: pd.DataFrame | None, setting: str):
@@ -254,7 +245,7 @@ def main(arguments: list[str] | None = None) -> int:
         return status
     kept = options.out / "rover.parquet"
     known = pd.read_parquet(kept) if options.report and kept.exists() else None
-    setting = setting_text(steps)
+    setting = setting_text({**SETTINGS, "total_steps": steps})
     rows, missing = evaluate_policies(options.run, episodes, known, setting)
     if rows.empty:
         print(f"nothing is trained in {options.run} yet")

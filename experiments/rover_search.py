@@ -10,12 +10,15 @@ A setting whose row is there already is not trained again.
 
 import argparse
 import pathlib
+import sys
 import time
 
 import numpy as np
-import pandas as pd
 
 import rtd3jax as rtd
+
+sys.path.insert(0, str(pathlib.Path(__file__).parent))
+from searching import go_through  # noqa: E402
 
 RESULTS = pathlib.Path(__file__).parent / "results" / "rover_search.csv"
 FIRST_SEED = 100
@@ -155,7 +158,7 @@ CHANGES: tuple[dict, ...] = (
 
 
 def search(setting: dict, width: int, episodes: int) -> dict:
-    """Train the setting and evaluate it under nominal slip; a row of the table."""
+    """Train the setting and evaluate it under nominal slip; the results of a row."""
     began = time.perf_counter()
     fields = {name: value for name, value in setting.items() if name in RTD_FIELDS}
     config = rtd.Config(
@@ -172,7 +175,6 @@ def search(setting: dict, width: int, episodes: int) -> dict:
         float(np.mean(rtd.evaluate(run.policy(seed), env, episodes, seed=9))) for seed in seeds
     ]
     return {
-        **setting,
         "mean_return": round(float(np.mean(finals)), 4),
         "worst_seed": round(min(finals), 4),
         "ceiling": round(rtd.ceiling(env, episodes).mean, 4),
@@ -191,16 +193,13 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     tiny = {"total_steps": 1_200} if options.quick else {}
     width, episodes = (8, 10) if options.quick else (128, 1_000)
-    rows = pd.read_csv(options.out).to_dict("records") if options.out.exists() else []
-    rows = [{**BASE, **row} for row in rows]  # what was not varied then stood at its default
-    for change in CHANGES[:2] if options.quick else CHANGES:
-        setting = {**BASE, **change, **tiny}
-        if any(all(row[name] == value for name, value in setting.items()) for row in rows):
-            continue
-        rows.append(search(setting, width, episodes))
-        print(rows[-1], flush=True)
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        pd.DataFrame(rows).to_csv(options.out, index=False)
+    changes = CHANGES[:2] if options.quick else CHANGES
+    go_through(
+        ({**BASE, **change, **tiny} for change in changes),
+        lambda setting: search(setting, width, episodes),
+        options.out,
+        BASE,
+    )
 
 
 if __name__ == "__main__":

@@ -135,13 +135,17 @@ def test_the_pendulum_experiment_runs(tmp_path, capsys, monkeypatch):
     assert (out / "pendulum_learning_curves.png").stat().st_size > 5_000
     assert "not run" in capsys.readouterr().out
 
+    # Columns of a table from before settings were noted are marked.
+    table.drop(columns="setting").to_parquet(out / "pendulum.parquet")
     more = ["--disturbances", "hidden", "--run", str(tmp_path / "more"), "--out", str(out)]
     assert pendulum.main(["--quick", *more]) == 0
     both = pd.read_parquet(out / "pendulum.parquet").set_index("disturbance")
     assert set(both.index) == {"random-sine", "hidden"} and set(both["steps"]) == {40}
     assert both["mean"]["random-sine"] == table["mean"][0]
     assert (out / "pendulum_40_steps_learning_curves.png").exists()
-    assert "missing: generalisation" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "missing: generalisation" in said and "| random-sine † |" in said
+    assert "| hidden |" in said and "† trained with the configuration's defaults" in said
 
     pictures = load(EXPERIMENTS / "pendulum_pictures.py")
     assert pictures.main(["--quick", "--run", str(run), "--out", str(out)]) == 0

@@ -32,8 +32,10 @@ def test_killed_sweeps_resume_to_the_same_bits(monkeypatch):
     assert load(EXPERIMENTS / "reliability" / "kill_and_resume.py").main(["--quick"]) == 0
 
 
-def test_the_search_runs_and_keeps_its_rows(tmp_path, monkeypatch):
-    search = load(EXPERIMENTS / "rover_search.py")
+@pytest.mark.parametrize("plant", ["rover", "pendulum"])
+def test_the_search_runs_and_keeps_its_rows(plant, tmp_path, monkeypatch):
+    search = load(EXPERIMENTS / f"{plant}_search.py")
+    monkeypatch.setattr(search, "scale", lambda name: (-1200.0, -136.0), raising=False)
     monkeypatch.setattr(search, "CHANGES", ({"gamma": 0.5},))
     out = tmp_path / "search.csv"
     search.main(["--quick", "--out", str(out)])
