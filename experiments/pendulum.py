@@ -2,18 +2,14 @@
 
 Usage: python experiments/pendulum.py [--quick] [--run DIR] [--out DIR] [--steps N] [--seeds N]
                                       [--lengths L ...] [--width H] [--disturbances D ...]
-                                      [--report]
+                                      [--algorithms A ...] [--report]
 
-Trains every agent under four disturbances, and `lstm-td3` with and without action history also
-fully observed, under `temporal-bias` and under stronger noise, in a run directory of the sweep; the
+Trains the studies of experiments/pendulum_studies.py in run directories of the sweep below DIR; the
 same command goes on with what is missing. Then tests the agents of `random-sine` under five other
 conditions, 1,000 episodes each. Writes pendulum.md, .parquet and .png, the learning curves, and
 generalisation.md and .parquet. The paper has five seeds, lengths 1 to 20 and width 128; the table
-says what was run. `--report` does not train.
-
-One setting for all agents: experiments/pendulum_search.py found it on seeds that are not reported,
-under `hidden`. With `--disturbances` the rows of others stay as they are; those of an earlier
-setting are marked.
+says what was run. `--report` does not train. With `--disturbances` or `--algorithms` the rows of
+others stay as they are; those of an earlier setting are marked.
 
 Returns are normalised: 0 is the uniform-random policy, 1 the fully observed optimum.
 """
@@ -29,9 +25,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 import rtd3jax as rtd
-from rtd3jax import sweep
 from rtd3jax.envs.registry import parse_disturbance
-from rtd3jax.errors import UserError
 from rtd3jax.study.figures import COLOURS
 from rtd3jax.study.results import EPISODES, read_table
 from rtd3jax.study.rundir import RunDirectory
@@ -39,7 +33,15 @@ from rtd3jax.study.statistics import seed_means
 from rtd3jax.study.transfer import transfer
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-from settings import flags, setting_text  # noqa: E402
+from pendulum_studies import (  # noqa: E402
+    DISTURBANCES,
+    OF_ACTION_HISTORY,
+    OWN_SETTINGS,
+    current_setting,
+    settings_of,
+    studies,
+)
+from settings import setting_text  # noqa: E402
 from writing import (  # noqa: E402
     RESULTS,
     keep_curves,
@@ -48,10 +50,6 @@ from writing import (  # noqa: E402
     write_results,
 )
 
-DISTURBANCES = (
-    *("temporal-sine", "random-sine", "noise", "hidden"),
-    *("none", "temporal-bias", "noise:sigma=1.0"),
-)
 CONDITIONS = (
     "random-sine",
     "combined-sine",
@@ -60,31 +58,9 @@ CONDITIONS = (
     "noise:sigma=1.0",
 )
 """Under which agents of `random-sine` are tested (the paper's generalisation figure)."""
-SETTINGS = {
-    "critic_learning_rate": 3e-3,
-    "actor_learning_rate": 3e-4,
-    "final_learning_rate_fraction": 0.0,
-    "gamma": 0.97,
-    "reward_scale": 0.1,
-    "exploration_noise": 0.5,
-    "replay_capacity": 10_000,
-}
+ALL_DISTURBANCES = (*DISTURBANCES, *OF_ACTION_HISTORY)
 GENERALISATION_EPISODES = 1_000
 REFERENCE_EPISODES = 1_000
-
-
-def train(run: pathlib.Path, options: argparse.Namespace, more: list[str]) -> int:
-    """Train what is missing; the sweep's exit status."""
-    lengths = [str(length) for length in options.lengths]
-    if options.disturbances:
-        more = ["--disturbances", *options.disturbances, "--algorithms", *rtd.ALGORITHMS, *more]
-    return sweep.main(
-        [
-            *("--preset", "pendulum", "--history-lengths", *lengths, "--out", str(run)),
-            *("--seeds", str(options.seeds), "--total-steps", str(options.steps)),
-            *("--hidden-size", str(options.width), *flags(SETTINGS), *more),
-        ]
-    )
 
 
 @functools.cache
@@ -103,63 +79,108 @@ def normalised(lanes: pd.DataFrame, column: str) -> pd.Series:
 
 
 def finals(run: pathlib.Path) -> pd.DataFrame:
-    """A row per lane: mean true-state return of the final episodes, and normalised."""
+    """A row per lane: mean true-state return of the final episodes, normalised, and what it was."""
     lanes = seed_means(read_table(run / "episodes.parquet", EPISODES))
     lanes = lanes[lanes["algorithm"].isin(rtd.ALGORITHMS)].copy()
     lanes["normalised"] = normalised(lanes, "disturbance")
+    lanes = with_settings(lanes, RunDirectory.open(run))
     return lanes.drop(columns="env").rename(columns={"true_return": "mean"})
 
 
-def with_others(lanes: pd.DataFrame, path: pathlib.Path) -> pd.DataFrame:
-    """``lanes``, and those of the table at ``path`` that trained under other disturbances."""
+def with_settings(lanes: pd.DataFrame, directory: RunDirectory) -> pd.DataFrame:
+    """``lanes`` and their ``steps``, ``width`` and ``setting``."""
+    configs = {cell.config.algorithm: cell.config for cell in directory.cells}
+    settings = {
+        name: setting_text({field: getattr(config, field) for field in settings_of(name)})
+        for name, config in configs.items()
+    }
+    agents = lanes["algorithm"]
+    return lanes.assign(
+        steps=agents.map(lambda name: configs[name].total_steps),
+        width=agents.map(lambda name: configs[name].hidden_size),
+        setting=agents.map(settings),
+    )
+
+
+def with_others(lanes: pd.DataFrame, path: pathlib.Path, column: str) -> pd.DataFrame:
+    """``lanes``, and those of the table at ``path`` of other agents or values of ``column``."""
     if not path.exists():
         return lanes
     kept = pd.read_parquet(path)
     if "setting" not in kept:
         kept["setting"] = "the configuration's defaults"  # as all tables were, when none was noted
-    return pd.concat([lanes, kept[~kept["disturbance"].isin(lanes["disturbance"])]])
+    key = ["algorithm", column]
+    replaced = pd.MultiIndex.from_frame(kept[key]).isin(pd.MultiIndex.from_frame(lanes[key]))
+    return pd.concat([lanes, kept[~replaced]], ignore_index=True)
 
 
-def of_each(lanes: pd.DataFrame, column: str) -> dict[str, object]:
-    """``steps``, ``width`` or ``setting`` of each disturbance."""
-    return {name: own[column].tolist()[0] for name, own in lanes.groupby("disturbance")}
+def of_each(lanes: pd.DataFrame, column: str) -> dict[str, str]:
+    """``steps``, ``width`` or number of seeds of each disturbance; by agent where they differ."""
+    found = {}
+    for name, here in lanes.groupby("disturbance"):
+        agents = here.groupby(column)["algorithm"].unique()
+        parts = [
+            f"{value:,}" if len(agents) == 1 else f"{value:,} ({', '.join(sorted(own))})"
+            for value, own in agents.items()
+        ]
+        found[name] = ", ".join(parts)
+    return found
 
 
 def generalisation(run: pathlib.Path, episodes: int) -> pd.DataFrame:
-    """A row per lane of `random-sine` and condition; normalised as in `finals`."""
+    """A row per lane of `random-sine` and condition, as in `finals`; none if none is trained."""
     directory = RunDirectory.open(run)
     directory.cells = [cell for cell in directory.cells if cell.disturbance == "random-sine"]
+    if not directory.cells:
+        return pd.DataFrame()
     table = transfer(directory, CONDITIONS, episodes, write=False)
     lane = ["algorithm", "history_length", "tested_on", "seed"]
     lanes = table.groupby(lane, as_index=False)["true_return"].mean()
     lanes["normalised"] = normalised(lanes, "tested_on")
-    return lanes
+    return with_settings(lanes, directory)
 
 
 def table(lanes: pd.DataFrame, column: str, names: tuple[str, ...]) -> str:
     """Agents and lengths down, disturbances across: mean normalised return ± std over seeds.
 
-    Columns that were trained with an earlier setting are marked.
+    Cells that were trained with an earlier setting are marked.
     """
-    older = lanes[lanes["setting"] != setting_text(SETTINGS)]
-    header = [f"{name} †" if (older[column] == name).any() else name for name in names]
+    current = lanes["algorithm"].map(current_setting)
+    older = lanes[lanes["setting"] != current]
     body = []
     for algorithm in rtd.ALGORITHMS:
         own = lanes[lanes["algorithm"] == algorithm]
         for length in sorted(own["history_length"].unique()):
             line = [algorithm, str(length or "–")]
             for name in names:
-                here = own[(own["history_length"] == length) & (own[column] == name)]["normalised"]
-                spread = f" ± {here.std(ddof=1):.3f}" if len(here) > 1 else ""
-                line.append(f"{here.mean():.3f}{spread}" if len(here) else "not run")
+                here = own[(own["history_length"] == length) & (own[column] == name)]
+                values = here["normalised"]
+                spread = f" ± {values.std(ddof=1):.3f}" if len(values) > 1 else ""
+                mark = " †" if here.index.isin(older.index).any() else ""
+                line.append(f"{values.mean():.3f}{spread}{mark}" if len(values) else "not run")
             body.append(line)
     notes = [f"\n† trained with {text}" for text in sorted({*older["setting"]})]
-    return "\n".join([markdown_table(["agent", "l", *header], body), *notes])
+    return "\n".join([markdown_table(["agent", "l", *names], body), *notes])
+
+
+def facts(lanes: pd.DataFrame, began: float) -> dict[str, object]:
+    """What was run, for the table's foot."""
+    return provenance(
+        normalised="0 is the uniform-random policy, 1 the fully observed optimum",
+        lanes=len(lanes),
+        seeds={name: own["seed"].nunique() for name, own in lanes.groupby("disturbance")},
+        lengths=sorted(int(length) for length in lanes["history_length"].unique()),
+        steps=of_each(lanes, "steps"),
+        width=of_each(lanes, "width"),
+        setting={name: current_setting(name) for name in ("td3", *OWN_SETTINGS)},
+        precision=rtd.Config.precision,
+        minutes_of_the_last_call=round((time.time() - began) / 60, 1),
+    )
 
 
 def draw(lanes: pd.DataFrame, path: pathlib.Path) -> None:
     """The paper's final returns against the agent: a panel per disturbance, dots are seeds."""
-    names = [name for name in DISTURBANCES if (lanes["disturbance"] == name).any()]
+    names = [name for name in ALL_DISTURBANCES if (lanes["disturbance"] == name).any()]
     figure = Figure(figsize=(2.6 * len(names) + 1.6, 3.4), layout="constrained")
     panels = np.atleast_1d(figure.subplots(1, len(names), sharey=True))
     for axes, name in zip(panels, names, strict=True):
@@ -174,10 +195,42 @@ def draw(lanes: pd.DataFrame, path: pathlib.Path) -> None:
                 axes.plot(x, values.mean(), "_", ms=9, mew=2, color=COLOURS[algorithm])
         axes.axhline(1.0, color="#777777", lw=0.8)
         axes.set_xticks(range(len(rtd.ALGORITHMS)), rtd.ALGORITHMS, rotation=60, ha="right")
-        axes.set_title(f"{name}\n{of_each(here, 'steps')[name]:,} steps", fontsize=10)
+        steps = sorted(here["steps"].unique())
+        axes.set_title(f"{name}\n{' and '.join(f'{n:,}' for n in steps)} steps", fontsize=10)
         axes.grid(axis="y", color="#E4E4E4", lw=0.6)
     panels[0].set_ylabel("normalised return")
     figure.savefig(path, dpi=150)
+
+
+def report(
+    runs: list[pathlib.Path], options: argparse.Namespace, episodes: int, began: float
+) -> int:
+    """Write tables and pictures of what there is in the studies' run directories."""
+    there = [run for run in runs if (run / "episodes.parquet").exists()]
+    if not there:
+        print(f"nothing is trained in {options.run} yet")
+        return 1
+    lanes = pd.concat([finals(run) for run in there], ignore_index=True)
+    lanes = with_others(lanes, options.out / "pendulum.parquet", "disturbance")
+    text = table(lanes, "disturbance", ALL_DISTURBANCES)
+    write_results(options.out, "pendulum", lanes, text, facts(lanes, began))
+    draw(lanes, options.out / "pendulum.png")
+    for run in there:
+        keep_curves(run, options.out, "_".join(["pendulum", run.name, *options.disturbances]))
+    print(text)
+    carried = [part for run in there if len(part := generalisation(run, episodes))]
+    if not carried:
+        print("missing: generalisation: nothing is trained under random-sine here")
+        return 0
+    moved = with_others(
+        pd.concat(carried, ignore_index=True), options.out / "generalisation.parquet", "tested_on"
+    )
+    text = table(moved, "tested_on", CONDITIONS)
+    under = lanes[lanes["disturbance"] == "random-sine"]
+    about = {**facts(under, began), "episodes": episodes}
+    write_results(options.out, "generalisation", moved, text, about)
+    print(text)
+    return 0
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -185,67 +238,27 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
     parser.add_argument("--run", type=pathlib.Path, default=pathlib.Path("runs/pendulum"))
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
-    parser.add_argument("--steps", type=int, default=30_000)
+    parser.add_argument("--steps", type=int, default=40_000, help="h-td3 has twice as many")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--lengths", type=int, nargs="+", default=[1, 3, 6, 10, 20])
     parser.add_argument("--width", type=int, default=128)
-    parser.add_argument("--disturbances", nargs="+", metavar="D", help="no others")
+    parser.add_argument("--disturbances", nargs="+", metavar="D", default=[], help="no others")
+    parser.add_argument("--algorithms", nargs="+", metavar="A", default=list(rtd.ALGORITHMS))
     parser.add_argument("--report", action="store_true", help="no training")
     options = parser.parse_args(arguments)
     began, more, episodes = time.time(), [], GENERALISATION_EPISODES
     if options.quick:
         options.steps, options.seeds, options.lengths, options.width = 40, 1, [1], 4
         more = ["--batch-size=4", "--learning-starts=10", "--eval-every=40", "--eval-episodes=1"]
-        more += ["--final-episodes=1", "--quiet", "--no-report", "--algorithms", "td3"]
-        if not options.disturbances:
-            more += ["--disturbances", "random-sine"]
-        episodes = 2
-    status = 0 if options.report else train(options.run, options, more)
-    if status not in (0, 1):
-        return status
-    lanes = finals(options.run)
-    if options.disturbances:
-        lanes = lanes[lanes["disturbance"].isin(options.disturbances)]
-    if lanes.empty:
-        print(f"nothing is trained in {options.run} yet")
-        return 1
-    config = RunDirectory.open(options.run).cells[0].config
-    setting = setting_text({name: getattr(config, name) for name in SETTINGS})
-    lanes = lanes.assign(steps=config.total_steps, width=config.hidden_size, setting=setting)
-    curves, carried_from = "pendulum", lanes[lanes["disturbance"] == "random-sine"]
-    if options.disturbances:
-        curves = f"pendulum_{config.total_steps}_steps"
-        lanes = with_others(lanes, options.out / "pendulum.parquet")
-
-    def facts(lanes: pd.DataFrame) -> dict[str, object]:
-        return provenance(
-            normalised="0 is the uniform-random policy, 1 the fully observed optimum",
-            lanes=len(lanes),
-            seeds={name: own["seed"].nunique() for name, own in lanes.groupby("disturbance")},
-            lengths=sorted(int(length) for length in lanes["history_length"].unique()),
-            steps=of_each(lanes, "steps"),
-            width=of_each(lanes, "width"),
-            setting=of_each(lanes, "setting"),
-            precision=config.precision,
-            minutes_of_the_last_call=round((time.time() - began) / 60, 1),
-        )
-
-    text = table(lanes, "disturbance", DISTURBANCES)
-    write_results(options.out, "pendulum", lanes, text, facts(lanes))
-    draw(lanes, options.out / "pendulum.png")
-    keep_curves(options.run, options.out, curves)
-    print(text)
-    try:
-        carried = generalisation(options.run, episodes).assign(setting=setting)
-    except UserError as error:
-        print(f"missing: generalisation: {error}")
-        return 0
-    text = table(carried, "tested_on", CONDITIONS)
-    write_results(
-        options.out, "generalisation", carried, text, {**facts(carried_from), "episodes": episodes}
-    )
-    print(text)
-    return 0
+        more += ["--final-episodes=1", "--quiet", "--no-report"]
+        options.disturbances, episodes = options.disturbances or ["random-sine"], 2
+    runs = []
+    for study in studies(options.disturbances, options.algorithms):
+        status = 0 if options.report else study.train(options.run / study.name, options, more)
+        if status not in (0, 1):
+            return status
+        runs.append(options.run / study.name)
+    return report(runs, options, episodes, began)
 
 
 if __name__ == "__main__":

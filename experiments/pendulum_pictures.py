@@ -67,7 +67,7 @@ def animate(plays: dict[str, dict[str, np.ndarray]], path: pathlib.Path, every: 
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--run", type=pathlib.Path, default=pathlib.Path("runs/pendulum"))
+    parser.add_argument("--run", type=pathlib.Path, default=pathlib.Path("runs/pendulum/main"))
     parser.add_argument("--disturbance", default="random-sine")
     parser.add_argument("--history-length", type=int, default=6)
     parser.add_argument("--seed", type=int, default=0, help="of the policies")

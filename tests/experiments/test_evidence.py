@@ -40,7 +40,7 @@ def test_the_rover_experiment_runs_and_says_what_is_missing(tmp_path, capsys):
     pd.testing.assert_frame_equal(again, rows)
 
     pictures = load(EXPERIMENTS / "rover_pictures.py")
-    assert pictures.main(["--quick", "--run", str(run), "--out", str(out)]) == 0
+    assert pictures.main(["--quick", "--run", str(run / "main"), "--out", str(out)]) == 0
     assert "missing: " in capsys.readouterr().out
     assert (out / "rover_inferred_slip.png").exists()
     assert (out / "rover_drive.gif").read_bytes().startswith(b"GIF")
@@ -127,28 +127,32 @@ def test_the_pendulum_experiment_runs(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(pendulum, "REFERENCE_EPISODES", 2)
     monkeypatch.setattr(pendulum, "CONDITIONS", ("random-sine",))
     run, out = tmp_path / "run", tmp_path / "out"
-    assert pendulum.main(["--quick", "--run", str(run), "--out", str(out)]) == 0
-    table = pd.read_parquet(out / "pendulum.parquet")
-    assert len(table) == 1 and np.isfinite(table["normalised"]).all()
-    assert len(pd.read_parquet(out / "generalisation.parquet")) == 1
+    quick = ["--quick", "--algorithms", "td3", "h-td3", "--out", str(out)]
+    assert pendulum.main([*quick, "--run", str(run)]) == 0
+    table = pd.read_parquet(out / "pendulum.parquet").set_index("algorithm")
+    assert set(table.index) == {"td3", "h-td3"} and np.isfinite(table["normalised"]).all()
+    # The sixth agent has a setting of its own, and twice the steps.
+    assert table["steps"].to_dict() == {"td3": 40, "h-td3": 80}
+    assert "--replay-capacity=10000" in table["setting"]["h-td3"]
+    assert set(pd.read_parquet(out / "generalisation.parquet")["algorithm"]) == {"td3", "h-td3"}
     assert (out / "pendulum.png").stat().st_size > 5_000
-    assert (out / "pendulum_learning_curves.png").stat().st_size > 5_000
-    assert "not run" in capsys.readouterr().out
-
-    # Columns of a table from before settings were noted are marked.
-    table.drop(columns="setting").to_parquet(out / "pendulum.parquet")
-    more = ["--disturbances", "hidden", "--run", str(tmp_path / "more"), "--out", str(out)]
-    assert pendulum.main(["--quick", *more]) == 0
-    both = pd.read_parquet(out / "pendulum.parquet").set_index("disturbance")
-    assert set(both.index) == {"random-sine", "hidden"} and set(both["steps"]) == {40}
-    assert both["mean"]["random-sine"] == table["mean"][0]
-    assert (out / "pendulum_40_steps_learning_curves.png").exists()
+    assert (out / "pendulum_main_random-sine_learning_curves.png").stat().st_size > 5_000
     said = capsys.readouterr().out
-    assert "missing: generalisation" in said and "| random-sine † |" in said
-    assert "| hidden |" in said and "† trained with the configuration's defaults" in said
+    assert "not run" in said and "†" not in said
+
+    # Cells of a table from before settings were noted stay, and are marked.
+    table.reset_index().drop(columns="setting").to_parquet(out / "pendulum.parquet")
+    more = ["--disturbances", "hidden", "--algorithms", "td3", "--run", str(tmp_path / "more")]
+    assert pendulum.main([*quick, *more]) == 0
+    both = pd.read_parquet(out / "pendulum.parquet").set_index(["algorithm", "disturbance"])
+    assert set(both.index) == {(a, "random-sine") for a in table.index} | {("td3", "hidden")}
+    assert both["mean"][("td3", "random-sine")] == table["mean"]["td3"]
+    said = capsys.readouterr().out
+    assert "missing: generalisation" in said and said.count("†") == 3
+    assert "† trained with the configuration's defaults" in said
 
     pictures = load(EXPERIMENTS / "pendulum_pictures.py")
-    assert pictures.main(["--quick", "--run", str(run), "--out", str(out)]) == 0
+    assert pictures.main(["--quick", "--run", str(run / "main"), "--out", str(out)]) == 0
     assert "missing: " in capsys.readouterr().out
     assert (out / "pendulum_swing.gif").read_bytes().startswith(b"GIF")
 

@@ -1,0 +1,81 @@
+"""What experiments/pendulum.py trains: studies of the sweep, in folders of one directory.
+
+* ``main``: the agents that share a setting, under the paper's four disturbances;
+* ``h-td3``: the sixth agent, with more exploration, a shorter memory and twice the steps. Its
+  critics read carries that an actor of long ago stored, and its actor moves on meanwhile;
+* ``action-history``: `lstm-td3` with and without past actions, where the paper compares them.
+
+experiments/pendulum_search.py found the settings, under `hidden`.
+"""
+
+import argparse
+import dataclasses
+import pathlib
+
+from settings import flags, setting_text
+
+from rtd3jax import sweep
+
+DISTURBANCES = ("temporal-sine", "random-sine", "noise", "hidden")
+OF_ACTION_HISTORY = ("none", "temporal-bias", "noise:sigma=1.0")
+SETTINGS: dict[str, object] = {
+    "critic_learning_rate": 3e-3,
+    "actor_learning_rate": 3e-4,
+    "final_learning_rate_fraction": 0.0,
+    "gamma": 0.97,
+    "reward_scale": 0.1,
+    "exploration_noise": 0.2,
+}
+OWN_SETTINGS: dict[str, dict[str, object]] = {
+    "h-td3": {"exploration_noise": 0.5, "replay_capacity": 10_000},
+}
+STEPS_FACTOR = {"h-td3": 2}
+
+
+def settings_of(algorithm: str) -> dict[str, object]:
+    """Fields of the configuration in which the agent differs from the defaults."""
+    return {**SETTINGS, **OWN_SETTINGS.get(algorithm, {})}
+
+
+def current_setting(algorithm: str) -> str:
+    """`settings_of` the agent, as it stands in tables."""
+    return setting_text(settings_of(algorithm))
+
+
+@dataclasses.dataclass(frozen=True)
+class Study:
+    """A study of the sweep: its folder's name, and what is crossed in it."""
+
+    name: str
+    disturbances: tuple[str, ...]
+    algorithms: tuple[str, ...]
+
+    def train(self, run: pathlib.Path, options: argparse.Namespace, more: list[str]) -> int:
+        """Train in ``run`` what is missing; the sweep's exit status."""
+        first = self.algorithms[0]
+        settings = {
+            **settings_of(first),
+            "total_steps": options.steps * STEPS_FACTOR.get(first, 1),
+            "hidden_size": options.width,
+        }
+        lengths = map(str, options.lengths)
+        return sweep.main(
+            [
+                *("--env", "pendulum", "--out", str(run), "--seeds", str(options.seeds)),
+                *("--disturbances", *self.disturbances, "--algorithms", *self.algorithms),
+                *("--history-lengths", *lengths, *flags(settings), *more),
+            ]
+        )
+
+
+def studies(disturbances: tuple[str, ...] | None, algorithms: tuple[str, ...]) -> list[Study]:
+    """The paper's, or those of the given disturbances alone, without agents that are not given."""
+    together = tuple(name for name in algorithms if name not in OWN_SETTINGS)
+    alone = [name for name in algorithms if name in OWN_SETTINGS]
+    found = [Study(name, disturbances or DISTURBANCES, (name,)) for name in alone]
+    if together:
+        found.insert(0, Study("main", disturbances or DISTURBANCES, together))
+    compared = tuple(name for name in ("lstm-td3", "lstm-td3-no-action") if name in algorithms)
+    if compared and not disturbances:
+        found.append(Study("action-history", OF_ACTION_HISTORY, compared))
+    return found
