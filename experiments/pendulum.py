@@ -8,8 +8,9 @@ Trains the studies of experiments/pendulum_studies.py in run directories of the 
 same command goes on with what is missing. Then tests the agents of `random-sine` under five other
 conditions, 1,000 episodes each. Writes pendulum.md, .parquet and .png, the learning curves, and
 generalisation.md and .parquet. The paper has five seeds, lengths 1 to 20 and width 128; the table
-says what was run. `--report` does not train. With `--disturbances` or `--algorithms` the rows of
-others stay as they are; those of an earlier setting are marked.
+says what was run. `--report` does not train. `--disturbances` and `--algorithms` are for parts of
+it, each in another DIR. Rows of lanes that are not in DIR stay as they are; those of an earlier
+setting are marked.
 
 Returns are normalised: 0 is the uniform-random policy, 1 the fully observed optimum.
 """
@@ -37,6 +38,7 @@ from pendulum_studies import (  # noqa: E402
     DISTURBANCES,
     OF_ACTION_HISTORY,
     OWN_SETTINGS,
+    SETTINGS,
     current_setting,
     settings_of,
     studies,
@@ -74,7 +76,7 @@ def scale(name: str) -> tuple[float, float]:
 
 def normalised(lanes: pd.DataFrame, column: str) -> pd.Series:
     """``true_return`` between the two ends of the disturbance that ``column`` names."""
-    low, high = (lanes[column].map(lambda name, end=end: scale(name)[end]) for end in (0, 1))
+    low, high = np.array([scale(name) for name in lanes[column]], np.float64).reshape(-1, 2).T
     return (lanes["true_return"] - low) / (high - low)
 
 
@@ -83,39 +85,34 @@ def finals(run: pathlib.Path) -> pd.DataFrame:
     lanes = seed_means(read_table(run / "episodes.parquet", EPISODES))
     lanes = lanes[lanes["algorithm"].isin(rtd.ALGORITHMS)].copy()
     lanes["normalised"] = normalised(lanes, "disturbance")
-    lanes = with_settings(lanes, RunDirectory.open(run))
-    return lanes.drop(columns="env").rename(columns={"true_return": "mean"})
-
-
-def with_settings(lanes: pd.DataFrame, directory: RunDirectory) -> pd.DataFrame:
-    """``lanes`` and their ``steps``, ``width`` and ``setting``."""
-    configs = {cell.config.algorithm: cell.config for cell in directory.cells}
-    settings = {
-        name: setting_text({field: getattr(config, field) for field in settings_of(name)})
-        for name, config in configs.items()
-    }
-    agents = lanes["algorithm"]
-    return lanes.assign(
-        steps=agents.map(lambda name: configs[name].total_steps),
-        width=agents.map(lambda name: configs[name].hidden_size),
-        setting=agents.map(settings),
+    config = RunDirectory.open(run).cells[0].config  # agents of a study share all but what they are
+    return (
+        lanes.drop(columns="env")
+        .assign(steps=config.total_steps, width=config.hidden_size, setting=own_setting(config))
+        .rename(columns={"true_return": "mean"})
     )
 
 
+def own_setting(config: rtd.Config) -> str:
+    """What `current_setting` would say of this configuration."""
+    fields = settings_of(config.algorithm)
+    return setting_text({name: getattr(config, name) for name in fields})
+
+
 def with_others(lanes: pd.DataFrame, path: pathlib.Path, column: str) -> pd.DataFrame:
-    """``lanes``, and those of the table at ``path`` of other agents or values of ``column``."""
+    """``lanes``, and the others of the table at ``path``; ``column`` tells a lane's rows apart."""
     if not path.exists():
         return lanes
     kept = pd.read_parquet(path)
     if "setting" not in kept:
         kept["setting"] = "the configuration's defaults"  # as all tables were, when none was noted
-    key = ["algorithm", column]
+    key = ["algorithm", "history_length", column, "seed"]
     replaced = pd.MultiIndex.from_frame(kept[key]).isin(pd.MultiIndex.from_frame(lanes[key]))
     return pd.concat([lanes, kept[~replaced]], ignore_index=True)
 
 
 def of_each(lanes: pd.DataFrame, column: str) -> dict[str, str]:
-    """``steps``, ``width`` or number of seeds of each disturbance; by agent where they differ."""
+    """``steps``, ``width`` or ``seeds`` of each disturbance; by agent where they differ."""
     found = {}
     for name, here in lanes.groupby("disturbance"):
         agents = here.groupby(column)["algorithm"].unique()
@@ -133,11 +130,15 @@ def generalisation(run: pathlib.Path, episodes: int) -> pd.DataFrame:
     directory.cells = [cell for cell in directory.cells if cell.disturbance == "random-sine"]
     if not directory.cells:
         return pd.DataFrame()
-    table = transfer(directory, CONDITIONS, episodes, write=False)
+    try:
+        table = transfer(directory, CONDITIONS, episodes, write=False)
+    except rtd.UserError as error:
+        print(f"missing: generalisation of {run.name}: {error}")
+        return pd.DataFrame()
     lane = ["algorithm", "history_length", "tested_on", "seed"]
     lanes = table.groupby(lane, as_index=False)["true_return"].mean()
     lanes["normalised"] = normalised(lanes, "tested_on")
-    return with_settings(lanes, directory)
+    return lanes.assign(setting=own_setting(directory.cells[0].config))
 
 
 def table(lanes: pd.DataFrame, column: str, names: tuple[str, ...]) -> str:
@@ -145,8 +146,7 @@ def table(lanes: pd.DataFrame, column: str, names: tuple[str, ...]) -> str:
 
     Cells that were trained with an earlier setting are marked.
     """
-    current = lanes["algorithm"].map(current_setting)
-    older = lanes[lanes["setting"] != current]
+    older = lanes["setting"] != lanes["algorithm"].map(current_setting)
     body = []
     for algorithm in rtd.ALGORITHMS:
         own = lanes[lanes["algorithm"] == algorithm]
@@ -156,23 +156,28 @@ def table(lanes: pd.DataFrame, column: str, names: tuple[str, ...]) -> str:
                 here = own[(own["history_length"] == length) & (own[column] == name)]
                 values = here["normalised"]
                 spread = f" ± {values.std(ddof=1):.3f}" if len(values) > 1 else ""
-                mark = " †" if here.index.isin(older.index).any() else ""
+                marked = int(older[here.index].sum())
+                mark = (
+                    "" if not marked else " †" if marked == len(here) else f" († {marked} of them)"
+                )
                 line.append(f"{values.mean():.3f}{spread}{mark}" if len(values) else "not run")
             body.append(line)
-    notes = [f"\n† trained with {text}" for text in sorted({*older["setting"]})]
+    notes = [f"\n† trained with {text}" for text in sorted({*lanes["setting"][older]})]
     return "\n".join([markdown_table(["agent", "l", *names], body), *notes])
 
 
 def facts(lanes: pd.DataFrame, began: float) -> dict[str, object]:
     """What was run, for the table's foot."""
+    cells = lanes.groupby(["algorithm", "history_length", "disturbance"])
     return provenance(
         normalised="0 is the uniform-random policy, 1 the fully observed optimum",
         lanes=len(lanes),
-        seeds={name: own["seed"].nunique() for name, own in lanes.groupby("disturbance")},
+        seeds=of_each(lanes.assign(seeds=cells["seed"].transform("nunique")), "seeds"),
         lengths=sorted(int(length) for length in lanes["history_length"].unique()),
         steps=of_each(lanes, "steps"),
         width=of_each(lanes, "width"),
-        setting={name: current_setting(name) for name in ("td3", *OWN_SETTINGS)},
+        setting_where_not_marked=setting_text(SETTINGS),
+        and_besides=OWN_SETTINGS,
         precision=rtd.Config.precision,
         minutes_of_the_last_call=round((time.time() - began) / 60, 1),
     )
@@ -206,21 +211,22 @@ def report(
     runs: list[pathlib.Path], options: argparse.Namespace, episodes: int, began: float
 ) -> int:
     """Write tables and pictures of what there is in the studies' run directories."""
-    there = [run for run in runs if (run / "episodes.parquet").exists()]
-    if not there:
+    begun = [run for run in runs if (run / "episodes.parquet").exists()]
+    found = {run: lanes for run in begun if len(lanes := finals(run))}
+    if not found:
         print(f"nothing is trained in {options.run} yet")
         return 1
-    lanes = pd.concat([finals(run) for run in there], ignore_index=True)
+    lanes = pd.concat(found.values(), ignore_index=True)
     lanes = with_others(lanes, options.out / "pendulum.parquet", "disturbance")
     text = table(lanes, "disturbance", ALL_DISTURBANCES)
     write_results(options.out, "pendulum", lanes, text, facts(lanes, began))
     draw(lanes, options.out / "pendulum.png")
-    for run in there:
-        keep_curves(run, options.out, "_".join(["pendulum", run.name, *options.disturbances]))
+    for run in found:
+        keep_curves(run, options.out, f"pendulum_{options.run.name}_{run.name}")
     print(text)
-    carried = [part for run in there if len(part := generalisation(run, episodes))]
+    carried = [part for run in found if len(part := generalisation(run, episodes))]
     if not carried:
-        print("missing: generalisation: nothing is trained under random-sine here")
+        print("missing: generalisation: nothing is trained under random-sine")
         return 0
     moved = with_others(
         pd.concat(carried, ignore_index=True), options.out / "generalisation.parquet", "tested_on"

@@ -3,9 +3,9 @@
 Usage: python experiments/pendulum_pictures.py [--run DIR] [--disturbance D] [--history-length L]
                                                [--seed N] [--agents A B] [--out DIR] [--quick]
 
-Loads two policies that experiments/pendulum.py trained and lets them play the same twenty episodes;
-shown is the one in which their returns differ by the median. Writes pendulum_swing.gif: the
-pendulum as it is, the one that the sensors report, and what the disturbance does to the angular
+Loads two policies of one study of experiments/pendulum.py and lets them play the same twenty
+episodes; shown is the one in which their returns differ by the median. Writes pendulum_swing.gif:
+the pendulum as it is, the one that the sensors report, and what the disturbance does to the angular
 velocity's reading beneath.
 """
 

@@ -11,6 +11,7 @@ experiments/pendulum_search.py found the settings, under `hidden`.
 import argparse
 import dataclasses
 import pathlib
+from collections.abc import Sequence
 
 from settings import flags, setting_text
 
@@ -53,6 +54,7 @@ class Study:
     def train(self, run: pathlib.Path, options: argparse.Namespace, more: list[str]) -> int:
         """Train in ``run`` what is missing; the sweep's exit status."""
         first = self.algorithms[0]
+        assert len({current_setting(name) for name in self.algorithms}) == 1
         settings = {
             **settings_of(first),
             "total_steps": options.steps * STEPS_FACTOR.get(first, 1),
@@ -68,13 +70,14 @@ class Study:
         )
 
 
-def studies(disturbances: tuple[str, ...] | None, algorithms: tuple[str, ...]) -> list[Study]:
-    """The paper's, or those of the given disturbances alone, without agents that are not given."""
+def studies(disturbances: Sequence[str], algorithms: Sequence[str]) -> list[Study]:
+    """Those of the given agents; without ``disturbances``, under the paper's."""
+    given = tuple(disturbances) or DISTURBANCES
     together = tuple(name for name in algorithms if name not in OWN_SETTINGS)
     alone = [name for name in algorithms if name in OWN_SETTINGS]
-    found = [Study(name, disturbances or DISTURBANCES, (name,)) for name in alone]
+    found = [Study(name, given, (name,)) for name in alone]
     if together:
-        found.insert(0, Study("main", disturbances or DISTURBANCES, together))
+        found.insert(0, Study("main", given, together))
     compared = tuple(name for name in ("lstm-td3", "lstm-td3-no-action") if name in algorithms)
     if compared and not disturbances:
         found.append(Study("action-history", OF_ACTION_HISTORY, compared))

@@ -17,6 +17,7 @@ def go_through(
     rows = pd.read_csv(out).to_dict("records") if out.exists() else []
     rows = [{**defaults, **row} for row in rows]
     for setting in settings:
+        assert setting.keys() <= defaults.keys(), "a field without its default"
         if any(all(row[name] == value for name, value in setting.items()) for row in rows):
             continue
         rows.append({**setting, **search(setting)})

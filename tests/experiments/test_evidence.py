@@ -4,6 +4,8 @@ import sys
 
 import numpy as np
 import pandas as pd
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
 import pytest
 from test_reliability import EXPERIMENTS, load
 
@@ -40,7 +42,7 @@ def test_the_rover_experiment_runs_and_says_what_is_missing(tmp_path, capsys):
     pd.testing.assert_frame_equal(again, rows)
 
     pictures = load(EXPERIMENTS / "rover_pictures.py")
-    assert pictures.main(["--quick", "--run", str(run / "main"), "--out", str(out)]) == 0
+    assert pictures.main(["--quick", "--run", str(run), "--out", str(out)]) == 0
     assert "missing: " in capsys.readouterr().out
     assert (out / "rover_inferred_slip.png").exists()
     assert (out / "rover_drive.gif").read_bytes().startswith(b"GIF")
@@ -136,9 +138,18 @@ def test_the_pendulum_experiment_runs(tmp_path, capsys, monkeypatch):
     assert "--replay-capacity=10000" in table["setting"]["h-td3"]
     assert set(pd.read_parquet(out / "generalisation.parquet")["algorithm"]) == {"td3", "h-td3"}
     assert (out / "pendulum.png").stat().st_size > 5_000
-    assert (out / "pendulum_main_random-sine_learning_curves.png").stat().st_size > 5_000
+    assert (out / "pendulum_run_main_learning_curves.png").stat().st_size > 5_000
     said = capsys.readouterr().out
     assert "not run" in said and "†" not in said
+
+    # Without a finished lane of random-sine there is nothing to carry over, and that is said.
+    lane = next((run / "h-td3" / "lanes").rglob("*.safetensors"))
+    kept = lane.read_bytes()
+    lane.unlink()
+    again = ["--report", "--run", str(run)]
+    assert pendulum.main([*quick, *again]) == 0
+    assert "missing: generalisation of " in capsys.readouterr().out
+    lane.write_bytes(kept)
 
     # Cells of a table from before settings were noted stay, and are marked.
     table.reset_index().drop(columns="setting").to_parquet(out / "pendulum.parquet")
@@ -149,6 +160,12 @@ def test_the_pendulum_experiment_runs(tmp_path, capsys, monkeypatch):
     assert both["mean"][("td3", "random-sine")] == table["mean"]["td3"]
     said = capsys.readouterr().out
     assert "missing: generalisation" in said and said.count("†") == 3
+    # Reference policies alone, as before the first lane ends, are nothing to report.
+    file = tmp_path / "more" / "main" / "episodes.parquet"
+    episodes = pq.read_table(file)
+    pq.write_table(episodes.filter(pc.field("algorithm") == "random"), file)
+    assert pendulum.main([*quick, *more, "--report"]) == 1
+    assert "nothing is trained" in capsys.readouterr().out
     assert "† trained with the configuration's defaults" in said
 
     pictures = load(EXPERIMENTS / "pendulum_pictures.py")
