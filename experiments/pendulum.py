@@ -5,12 +5,12 @@ Usage: python experiments/pendulum.py [--quick] [--run DIR] [--out DIR] [--steps
                                       [--algorithms A ...] [--report]
 
 Trains the studies of experiments/pendulum_studies.py in run directories of the sweep below DIR; the
-same command goes on with what is missing. Then tests the agents of `random-sine` under five other
-conditions, 1,000 episodes each. Writes pendulum.md, .parquet and .png, the learning curves, and
-generalisation.md and .parquet. The paper has five seeds, lengths 1 to 20 and width 128; the table
-says what was run. `--report` does not train. `--disturbances` and `--algorithms` are for parts of
-it, each in another DIR. Rows of lanes that are not in DIR stay as they are; those of an earlier
-setting are marked.
+same command goes on with what is missing. Then tests each agent under its own disturbance, and
+those of `random-sine` under five other conditions, 1,000 episodes each. Writes pendulum.md,
+.parquet and .png, the learning curves, and generalisation.md and .parquet. The paper has five
+seeds, lengths 1 to 20 and width 128; the table says what was run. `--report` does not train.
+`--disturbances` and `--algorithms` are for parts of it, each in another DIR. Rows of lanes that are
+not in DIR stay as they are; those of an earlier setting are marked.
 
 Returns are normalised: 0 is the uniform-random policy, 1 the fully observed optimum.
 """
@@ -20,6 +20,7 @@ import functools
 import pathlib
 import sys
 import time
+from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
@@ -27,10 +28,9 @@ from matplotlib.figure import Figure
 
 import rtd3jax as rtd
 from rtd3jax.envs.registry import parse_disturbance
+from rtd3jax.errors import UserError
 from rtd3jax.study.figures import COLOURS
-from rtd3jax.study.results import EPISODES, read_table
 from rtd3jax.study.rundir import RunDirectory
-from rtd3jax.study.statistics import seed_means
 from rtd3jax.study.transfer import transfer
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
@@ -61,7 +61,9 @@ CONDITIONS = (
 )
 """Under which agents of `random-sine` are tested (the paper's generalisation figure)."""
 ALL_DISTURBANCES = (*DISTURBANCES, *OF_ACTION_HISTORY)
-GENERALISATION_EPISODES = 1_000
+TEST_EPISODES = 1_000
+EARLIER_EPISODES = 20
+"""Of rows in a table that did not say yet."""
 REFERENCE_EPISODES = 1_000
 
 
@@ -80,17 +82,37 @@ def normalised(lanes: pd.DataFrame, column: str) -> pd.Series:
     return (lanes["true_return"] - low) / (high - low)
 
 
-def finals(run: pathlib.Path) -> pd.DataFrame:
-    """A row per lane: mean true-state return of the final episodes, normalised, and what it was."""
-    lanes = seed_means(read_table(run / "episodes.parquet", EPISODES))
-    lanes = lanes[lanes["algorithm"].isin(rtd.ALGORITHMS)].copy()
-    lanes["normalised"] = normalised(lanes, "disturbance")
-    config = RunDirectory.open(run).cells[0].config  # agents of a study share all but what they are
-    return (
-        lanes.drop(columns="env")
-        .assign(steps=config.total_steps, width=config.hidden_size, setting=own_setting(config))
-        .rename(columns={"true_return": "mean"})
+def tested(run: pathlib.Path, trained_on: str, on: Sequence[str], episodes: int) -> pd.DataFrame:
+    """A row per lane of a disturbance and condition: mean true-state return, and normalised.
+
+    Empty when no lane is trained yet.
+    """
+    directory = RunDirectory.open(run)
+    directory.cells = [cell for cell in directory.cells if cell.disturbance == trained_on]
+    if not directory.cells:
+        return pd.DataFrame()
+    try:
+        returns = transfer(directory, on, episodes, write=False)
+    except UserError as error:
+        print(f"missing: trained on {trained_on}: {error}")
+        return pd.DataFrame()
+    lane = ["algorithm", "history_length", "tested_on", "seed"]
+    lanes = returns.groupby(lane, as_index=False)["true_return"].mean()
+    lanes["normalised"] = normalised(lanes, "tested_on")
+    config = directory.cells[0].config  # agents of a study share all but what they are
+    return lanes.assign(
+        episodes=episodes,
+        steps=config.total_steps,
+        width=config.hidden_size,
+        setting=own_setting(config),
     )
+
+
+def finals(run: pathlib.Path, episodes: int) -> pd.DataFrame:
+    """`tested` under what each lane was trained on, its ``disturbance``."""
+    names = dict.fromkeys(cell.disturbance for cell in RunDirectory.open(run).cells)
+    lanes = pd.concat([tested(run, name, [name], episodes) for name in names], ignore_index=True)
+    return lanes.rename(columns={"tested_on": "disturbance", "true_return": "mean"})
 
 
 def own_setting(config: rtd.Config) -> str:
@@ -112,7 +134,7 @@ def with_others(lanes: pd.DataFrame, path: pathlib.Path, column: str) -> pd.Data
 
 
 def of_each(lanes: pd.DataFrame, column: str) -> dict[str, str]:
-    """``steps``, ``width`` or ``seeds`` of each disturbance; by agent where they differ."""
+    """``steps``, ``seeds`` and the like of each disturbance; by agent where they differ."""
     found = {}
     for name, here in lanes.groupby("disturbance"):
         agents = here.groupby(column)["algorithm"].unique()
@@ -122,23 +144,6 @@ def of_each(lanes: pd.DataFrame, column: str) -> dict[str, str]:
         ]
         found[name] = ", ".join(parts)
     return found
-
-
-def generalisation(run: pathlib.Path, episodes: int) -> pd.DataFrame:
-    """A row per lane of `random-sine` and condition, as in `finals`; none if none is trained."""
-    directory = RunDirectory.open(run)
-    directory.cells = [cell for cell in directory.cells if cell.disturbance == "random-sine"]
-    if not directory.cells:
-        return pd.DataFrame()
-    try:
-        table = transfer(directory, CONDITIONS, episodes, write=False)
-    except rtd.UserError as error:
-        print(f"missing: generalisation of {run.name}: {error}")
-        return pd.DataFrame()
-    lane = ["algorithm", "history_length", "tested_on", "seed"]
-    lanes = table.groupby(lane, as_index=False)["true_return"].mean()
-    lanes["normalised"] = normalised(lanes, "tested_on")
-    return lanes.assign(setting=own_setting(directory.cells[0].config))
 
 
 def table(lanes: pd.DataFrame, column: str, names: tuple[str, ...]) -> str:
@@ -176,6 +181,7 @@ def facts(lanes: pd.DataFrame, began: float) -> dict[str, object]:
         lengths=sorted(int(length) for length in lanes["history_length"].unique()),
         steps=of_each(lanes, "steps"),
         width=of_each(lanes, "width"),
+        episodes=of_each(lanes, "episodes"),
         setting_where_not_marked=setting_text(SETTINGS),
         and_besides=OWN_SETTINGS,
         precision=rtd.Config.precision,
@@ -211,22 +217,25 @@ def report(
     runs: list[pathlib.Path], options: argparse.Namespace, episodes: int, began: float
 ) -> int:
     """Write tables and pictures of what there is in the studies' run directories."""
-    begun = [run for run in runs if (run / "episodes.parquet").exists()]
-    found = {run: lanes for run in begun if len(lanes := finals(run))}
+    begun = [run for run in runs if (run / "config.json").exists()]
+    found = {run: lanes for run in begun if len(lanes := finals(run, episodes))}
     if not found:
         print(f"nothing is trained in {options.run} yet")
         return 1
     lanes = pd.concat(found.values(), ignore_index=True)
     lanes = with_others(lanes, options.out / "pendulum.parquet", "disturbance")
+    lanes["episodes"] = lanes["episodes"].fillna(EARLIER_EPISODES).astype(int)
     text = table(lanes, "disturbance", ALL_DISTURBANCES)
     write_results(options.out, "pendulum", lanes, text, facts(lanes, began))
     draw(lanes, options.out / "pendulum.png")
     for run in found:
         keep_curves(run, options.out, f"pendulum_{options.run.name}_{run.name}")
     print(text)
-    carried = [part for run in found if len(part := generalisation(run, episodes))]
+    carried = [
+        part for run in found if len(part := tested(run, "random-sine", CONDITIONS, episodes))
+    ]
     if not carried:
-        print("missing: generalisation: nothing is trained under random-sine")
+        print("missing: generalisation: nothing is trained on random-sine")
         return 0
     moved = with_others(
         pd.concat(carried, ignore_index=True), options.out / "generalisation.parquet", "tested_on"
@@ -252,7 +261,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--algorithms", nargs="+", metavar="A", default=list(rtd.ALGORITHMS))
     parser.add_argument("--report", action="store_true", help="no training")
     options = parser.parse_args(arguments)
-    began, more, episodes = time.time(), [], GENERALISATION_EPISODES
+    began, more, episodes = time.time(), [], TEST_EPISODES
     if options.quick:
         options.steps, options.seeds, options.lengths, options.width = 40, 1, [1], 4
         more = ["--batch-size=4", "--learning-starts=10", "--eval-every=40", "--eval-episodes=1"]
