@@ -64,7 +64,6 @@ CHANGES: tuple[dict, ...] = (
     {**NO_ACTION, **BETWEEN},
     {**H_TD3, **BETWEEN, "replay_capacity": 10_000},
     {**H_TD3, "exploration_noise": 0.4, "actor_noise": 0.1},
-    {**NO_ACTION, "exploration_noise": 0.5, "replay_capacity": 10_000},
 )
 """What each setting changes in `BASE`."""
 
