@@ -20,7 +20,6 @@ import functools
 import pathlib
 import sys
 import time
-from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
@@ -43,7 +42,7 @@ from pendulum_studies import (  # noqa: E402
     settings_of,
     studies,
 )
-from settings import setting_text  # noqa: E402
+from settings import mark, notes, setting_text  # noqa: E402
 from writing import (  # noqa: E402
     RESULTS,
     keep_curves,
@@ -82,21 +81,21 @@ def normalised(lanes: pd.DataFrame, column: str) -> pd.Series:
     return (lanes["true_return"] - low) / (high - low)
 
 
-def tested(run: pathlib.Path, trained_on: str, on: Sequence[str], episodes: int) -> pd.DataFrame:
+def tested(run: pathlib.Path, trained_on: str, episodes: int) -> pd.DataFrame:
     """A row per lane of a disturbance and condition: mean true-state return, and normalised.
 
-    Empty when no lane is trained yet.
+    The condition is what the lane was trained on; for `random-sine`, each of `CONDITIONS`. Empty
+    when no lane is trained yet.
     """
     directory = RunDirectory.open(run)
     directory.cells = [cell for cell in directory.cells if cell.disturbance == trained_on]
-    if not directory.cells:
-        return pd.DataFrame()
+    conditions = CONDITIONS if trained_on == "random-sine" else (trained_on,)
     try:
-        returns = transfer(directory, on, episodes, write=False)
+        returns = transfer(directory, conditions, episodes, write=False)
     except UserError as error:
         print(f"missing: trained on {trained_on}: {error}")
         return pd.DataFrame()
-    lane = ["algorithm", "history_length", "tested_on", "seed"]
+    lane = ["algorithm", "history_length", "trained_on", "tested_on", "seed"]
     lanes = returns.groupby(lane, as_index=False)["true_return"].mean()
     lanes["normalised"] = normalised(lanes, "tested_on")
     config = directory.cells[0].config  # agents of a study share all but what they are
@@ -108,11 +107,10 @@ def tested(run: pathlib.Path, trained_on: str, on: Sequence[str], episodes: int)
     )
 
 
-def finals(run: pathlib.Path, episodes: int) -> pd.DataFrame:
-    """`tested` under what each lane was trained on, its ``disturbance``."""
+def all_tested(run: pathlib.Path, episodes: int) -> pd.DataFrame:
+    """`tested` for each disturbance of a study."""
     names = dict.fromkeys(cell.disturbance for cell in RunDirectory.open(run).cells)
-    lanes = pd.concat([tested(run, name, [name], episodes) for name in names], ignore_index=True)
-    return lanes.rename(columns={"tested_on": "disturbance", "true_return": "mean"})
+    return pd.concat([tested(run, name, episodes) for name in names], ignore_index=True)
 
 
 def own_setting(config: rtd.Config) -> str:
@@ -161,14 +159,11 @@ def table(lanes: pd.DataFrame, column: str, names: tuple[str, ...]) -> str:
                 here = own[(own["history_length"] == length) & (own[column] == name)]
                 values = here["normalised"]
                 spread = f" ± {values.std(ddof=1):.3f}" if len(values) > 1 else ""
-                marked = int(older[here.index].sum())
-                mark = (
-                    "" if not marked else " †" if marked == len(here) else f" († {marked} of them)"
-                )
-                line.append(f"{values.mean():.3f}{spread}{mark}" if len(values) else "not run")
+                dagger = mark(int(older[here.index].sum()), len(here))
+                line.append(f"{values.mean():.3f}{spread}{dagger}" if len(values) else "not run")
             body.append(line)
-    notes = [f"\n† trained with {text}" for text in sorted({*lanes["setting"][older]})]
-    return "\n".join([markdown_table(["agent", "l", *names], body), *notes])
+    header = ["agent", "l", *names]
+    return "\n".join([markdown_table(header, body), *notes(lanes["setting"][older])])
 
 
 def facts(lanes: pd.DataFrame, began: float) -> dict[str, object]:
@@ -218,11 +213,13 @@ def report(
 ) -> int:
     """Write tables and pictures of what there is in the studies' run directories."""
     begun = [run for run in runs if (run / "config.json").exists()]
-    found = {run: lanes for run in begun if len(lanes := finals(run, episodes))}
+    found = {run: rows for run in begun if len(rows := all_tested(run, episodes))}
     if not found:
         print(f"nothing is trained in {options.run} yet")
         return 1
-    lanes = pd.concat(found.values(), ignore_index=True)
+    rows = pd.concat(found.values(), ignore_index=True)
+    lanes = rows[rows["trained_on"] == rows["tested_on"]].drop(columns="trained_on")
+    lanes = lanes.rename(columns={"tested_on": "disturbance", "true_return": "mean"})
     lanes = with_others(lanes, options.out / "pendulum.parquet", "disturbance")
     lanes["episodes"] = lanes["episodes"].fillna(EARLIER_EPISODES).astype(int)
     text = table(lanes, "disturbance", ALL_DISTURBANCES)
@@ -231,15 +228,11 @@ def report(
     for run in found:
         keep_curves(run, options.out, f"pendulum_{options.run.name}_{run.name}")
     print(text)
-    carried = [
-        part for run in found if len(part := tested(run, "random-sine", CONDITIONS, episodes))
-    ]
-    if not carried:
+    carried = rows[rows["trained_on"] == "random-sine"].drop(columns="trained_on")
+    if carried.empty:
         print("missing: generalisation: nothing is trained on random-sine")
         return 0
-    moved = with_others(
-        pd.concat(carried, ignore_index=True), options.out / "generalisation.parquet", "tested_on"
-    )
+    moved = with_others(carried, options.out / "generalisation.parquet", "tested_on")
     text = table(moved, "tested_on", CONDITIONS)
     under = lanes[lanes["disturbance"] == "random-sine"]
     about = {**facts(under, began), "episodes": episodes}

@@ -5,13 +5,11 @@ Usage: python experiments/pendulum_search.py [--quick] [--out FILE]
 One setting was sought for all agents, with the two that were furthest from the goal: `h-td3`, whose
 critics read carries that an actor of long ago stored, and `lstm-td3-no-action`, whose returns went
 up and down. What one of them needs costs the other, so there are two; pendulum_studies.py has them,
-with a third more steps. Width 64, as the table has.
-Seeds 100 and 101 are not reported elsewhere. Writes experiments/results/pendulum_search.csv: a row
-per setting, with the final policies' normalised return over 200 episodes. A setting whose row is
-there already is not trained again.
+with a third more steps. Width 64, as the table has. Seeds 100 and 101 are not reported elsewhere.
+Writes experiments/results/pendulum_search.csv: a row per setting, with the final policies'
+normalised return over 200 episodes. A setting whose row is there already is not trained again.
 """
 
-import argparse
 import pathlib
 import sys
 import time
@@ -22,7 +20,7 @@ import rtd3jax as rtd
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from pendulum import scale  # noqa: E402
-from searching import go_through  # noqa: E402
+from searching import search_main  # noqa: E402
 
 RESULTS = pathlib.Path(__file__).parent / "results" / "pendulum_search.csv"
 FIRST_SEED, SEEDS = 100, 2
@@ -89,19 +87,7 @@ def search(setting: dict, width: int, episodes: int) -> dict:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
-    parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
-    options = parser.parse_args(arguments)
-    tiny = {"total_steps": 1_200} if options.quick else {}
-    width, episodes = (8, 10) if options.quick else (64, 200)
-    changes = CHANGES[:2] if options.quick else CHANGES
-    go_through(
-        ({**BASE, **change, **tiny} for change in changes),
-        lambda setting: search(setting, width, episodes),
-        options.out,
-        BASE,
-    )
+    search_main(arguments, __doc__, RESULTS, BASE, CHANGES, search, width=64, episodes=200)
 
 
 if __name__ == "__main__":

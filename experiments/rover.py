@@ -27,7 +27,7 @@ from rtd3jax import sweep
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from claims import Effect  # noqa: E402
-from settings import flags, setting_text  # noqa: E402
+from settings import flags, mark, notes, setting_text  # noqa: E402
 from writing import (  # noqa: E402
     RESULTS,
     keep_curves,
@@ -169,8 +169,7 @@ def spread(here: pd.DataFrame, setting: str) -> str:
     count = "" if len(values) == SEEDS else f" ({len(values)} of {SEEDS} seeds)"
     deviation = f" ± {values.std(ddof=1):.2f}" if len(values) > 1 else ""
     older = int((here["setting"] != setting).sum())
-    mark = "" if not older else " †" if older == len(here) else f" († {older} of {len(here)})"
-    return f"{values.mean():.2f}{deviation}{count}{mark}"
+    return f"{values.mean():.2f}{deviation}{count}{mark(older, len(here))}"
 
 
 def table(rows: pd.DataFrame, others: dict[str, dict[str, str]], setting: str) -> str:
@@ -185,8 +184,7 @@ def table(rows: pd.DataFrame, others: dict[str, dict[str, str]], setting: str) -
         body += [mine, ["paper", *PAPER[algorithm]]]
     for name, values in others.items():
         body.append([f"*{name}*", *(values[tested] for _, tested in COLUMNS)])
-    notes = [f"\n† trained with {other}" for other in sorted({*rows["setting"]} - {setting})]
-    return "\n".join([markdown_table(header, body), *notes])
+    return "\n".join([markdown_table(header, body), *notes({*rows["setting"]} - {setting})])
 
 
 def order(rows: pd.DataFrame) -> str:

@@ -8,7 +8,6 @@ return of the final policies on `ar1-slip` (1,000 episodes a seed) beside the ce
 A setting whose row is there already is not trained again.
 """
 
-import argparse
 import pathlib
 import sys
 import time
@@ -18,7 +17,7 @@ import numpy as np
 import rtd3jax as rtd
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-from searching import go_through  # noqa: E402
+from searching import search_main  # noqa: E402
 
 RESULTS = pathlib.Path(__file__).parent / "results" / "rover_search.csv"
 FIRST_SEED = 100
@@ -187,19 +186,7 @@ RTD_FIELDS = set(BASE) - {"seeds", "train_on", "learning_rate", "actor_rate"}
 
 
 def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
-    parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
-    options = parser.parse_args(arguments)
-    tiny = {"total_steps": 1_200} if options.quick else {}
-    width, episodes = (8, 10) if options.quick else (128, 1_000)
-    changes = CHANGES[:2] if options.quick else CHANGES
-    go_through(
-        ({**BASE, **change, **tiny} for change in changes),
-        lambda setting: search(setting, width, episodes),
-        options.out,
-        BASE,
-    )
+    search_main(arguments, __doc__, RESULTS, BASE, CHANGES, search, width=128, episodes=1_000)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """A search over settings that may be stopped and gone on with: a row of a CSV for each setting."""
 
+import argparse
 import pathlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 import pandas as pd
 
@@ -24,3 +25,32 @@ def go_through(
         print(rows[-1], flush=True)
         out.parent.mkdir(parents=True, exist_ok=True)
         pd.DataFrame(rows).to_csv(out, index=False)
+
+
+def search_main(
+    arguments: list[str] | None,
+    description: str,
+    results: pathlib.Path,
+    base: dict,
+    changes: Sequence[dict],
+    search: Callable[[dict, int, int], dict],
+    width: int,
+    episodes: int,
+) -> None:
+    """The command line of a search: ``search(setting, width, episodes)`` for each of ``changes``.
+
+    With ``--quick`` the first two, tiny.
+    """
+    parser = argparse.ArgumentParser(description=description.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
+    parser.add_argument("--out", type=pathlib.Path, default=results)
+    options = parser.parse_args(arguments)
+    tiny = {}
+    if options.quick:
+        tiny, changes, width, episodes = {"total_steps": 1_200}, changes[:2], 8, 10
+    go_through(
+        ({**base, **change, **tiny} for change in changes),
+        lambda setting: search(setting, width, episodes),
+        options.out,
+        base,
+    )

@@ -159,11 +159,11 @@ def test_the_pendulum_experiment_runs(tmp_path, capsys, monkeypatch):
     assert both["mean"][("td3", "random-sine")] == table["mean"]["td3"]
     said = capsys.readouterr().out
     assert "missing: generalisation" in said and said.count("†") == 3
+    assert "† trained with the configuration's defaults" in said
     # Before the first lane ends there is nothing to report.
     shutil.rmtree(tmp_path / "more" / "main" / "lanes")
     assert pendulum.main([*quick, *more, "--report"]) == 1
     assert "nothing is trained" in capsys.readouterr().out
-    assert "† trained with the configuration's defaults" in said
 
     pictures = load(EXPERIMENTS / "pendulum_pictures.py")
     assert pictures.main(["--quick", "--run", str(run / "main"), "--out", str(out)]) == 0
