@@ -246,7 +246,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
     parser.add_argument("--run", type=pathlib.Path, default=pathlib.Path("runs/pendulum"))
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
-    parser.add_argument("--steps", type=int, default=40_000, help="h-td3 has twice as many")
+    parser.add_argument("--steps", type=int, default=40_000, help="h-td3 has three times as many")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--lengths", type=int, nargs="+", default=[1, 3, 6, 10, 20])
     parser.add_argument("--width", type=int, default=128)

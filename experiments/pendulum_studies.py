@@ -1,8 +1,9 @@
 """What experiments/pendulum.py trains: studies of the sweep, in folders of one directory.
 
 * ``main``: the agents that share a setting, under the paper's four disturbances;
-* ``h-td3``: the sixth agent, with more exploration, a shorter memory and twice the steps. Its
-  critics read carries that an actor of long ago stored, and its actor moves on meanwhile;
+* ``h-td3``: the sixth agent, with more exploration, a shorter memory, a slower actor and more
+  steps. Its critics read carries that an actor of long ago stored, and its actor moves on
+  meanwhile;
 * ``action-history``: `lstm-td3` with and without past actions, where the paper compares them.
 
 experiments/pendulum_search.py found the settings, under `hidden`.
@@ -28,9 +29,9 @@ SETTINGS: dict[str, object] = {
     "exploration_noise": 0.2,
 }
 OWN_SETTINGS: dict[str, dict[str, object]] = {
-    "h-td3": {"exploration_noise": 0.5, "replay_capacity": 10_000},
+    "h-td3": {"exploration_noise": 0.5, "replay_capacity": 20_000, "policy_delay": 4},
 }
-STEPS_FACTOR = {"h-td3": 2}
+STEPS_FACTOR = {"h-td3": 3}
 
 
 def settings_of(algorithm: str) -> dict[str, object]:
