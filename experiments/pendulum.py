@@ -29,6 +29,7 @@ import rtd3jax as rtd
 from rtd3jax.envs.registry import parse_disturbance
 from rtd3jax.errors import UserError
 from rtd3jax.study.figures import COLOURS
+from rtd3jax.study.presets import PENDULUM_HISTORY_LENGTHS, PENDULUM_STEPS
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.transfer import transfer
 
@@ -246,9 +247,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
     parser.add_argument("--run", type=pathlib.Path, default=pathlib.Path("runs/pendulum"))
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
-    parser.add_argument("--steps", type=int, default=40_000, help="h-td3 has three times as many")
+    parser.add_argument(
+        "--steps", type=int, default=PENDULUM_STEPS, help="h-td3 has three times as many"
+    )
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--lengths", type=int, nargs="+", default=[1, 3, 6, 10, 20])
+    parser.add_argument("--lengths", type=int, nargs="+", default=[*PENDULUM_HISTORY_LENGTHS])
     parser.add_argument("--width", type=int, default=128)
     parser.add_argument("--disturbances", nargs="+", metavar="D", default=[], help="no others")
     parser.add_argument("--algorithms", nargs="+", metavar="A", default=list(rtd.ALGORITHMS))

@@ -6,7 +6,8 @@
   meanwhile;
 * ``action-history``: `lstm-td3` with and without past actions, where the paper compares them.
 
-experiments/pendulum_search.py found the settings, under `hidden`.
+Their settings are those of the preset `pendulum`; experiments/pendulum_search.py found them, under
+`hidden`.
 """
 
 import argparse
@@ -17,21 +18,11 @@ from collections.abc import Sequence
 from settings import flags, setting_text
 
 from rtd3jax import sweep
-
-DISTURBANCES = ("temporal-sine", "random-sine", "noise", "hidden")
-OF_ACTION_HISTORY = ("none", "temporal-bias", "noise:sigma=1.0")
-SETTINGS: dict[str, object] = {
-    "critic_learning_rate": 3e-3,
-    "actor_learning_rate": 3e-4,
-    "final_learning_rate_fraction": 0.0,
-    "gamma": 0.97,
-    "reward_scale": 0.1,
-    "exploration_noise": 0.2,
-}
-OWN_SETTINGS: dict[str, dict[str, object]] = {
-    "h-td3": {"exploration_noise": 0.5, "replay_capacity": 20_000, "policy_delay": 4},
-}
-STEPS_FACTOR = {"h-td3": 3}
+from rtd3jax.study.presets import ACTION_HISTORY_DISTURBANCES as OF_ACTION_HISTORY
+from rtd3jax.study.presets import PENDULUM_DISTURBANCES as DISTURBANCES
+from rtd3jax.study.presets import PENDULUM_OWN_SETTINGS as OWN_SETTINGS
+from rtd3jax.study.presets import PENDULUM_SETTINGS as SETTINGS
+from rtd3jax.study.presets import PENDULUM_STEPS_FACTOR as STEPS_FACTOR
 
 
 def settings_of(algorithm: str) -> dict[str, object]:

@@ -6,8 +6,8 @@ Trains six agents under three slips, five seeds each, in a run directory of the 
 command goes on with what is missing. Then evaluates every policy there is under the processes of
 the paper's table. Writes rover.md, rover.parquet (a row per policy and process), rover.png and the
 learning curves. `--report` only evaluates what the table lacks; rows of an earlier setting stay,
-and are marked, where nothing was trained with this one. One setting for all agents:
-experiments/rover_search.py found it on seeds that are not among the five.
+and are marked, where nothing was trained with this one. One setting for all agents,
+that of the preset: experiments/rover_search.py found it on seeds that are not among the five.
 """
 
 import argparse
@@ -24,10 +24,13 @@ from matplotlib.figure import Figure
 
 import rtd3jax as rtd
 from rtd3jax import sweep
+from rtd3jax.study.presets import ROVER_HISTORY_LENGTH as HISTORY_LENGTH
+from rtd3jax.study.presets import ROVER_SETTINGS as SETTINGS
+from rtd3jax.study.presets import ROVER_STEPS as STEPS
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from claims import Effect  # noqa: E402
-from settings import flags, mark, notes, setting_text  # noqa: E402
+from settings import mark, notes, setting_text  # noqa: E402
 from writing import (  # noqa: E402
     RESULTS,
     keep_curves,
@@ -36,19 +39,6 @@ from writing import (  # noqa: E402
     write_results,
 )
 
-STEPS = 80_000
-SETTINGS = {
-    "gamma": 0.0,
-    "reward_scale": 10.0,
-    "critic_learning_rate": 3e-3,
-    "actor_learning_rate": 3e-3,
-    "final_learning_rate_fraction": 0.0,
-    "actor_noise": 0.1,
-    "update_every": 4,
-    "eval_every": 2_000,
-    "precision": "float32",
-}
-HISTORY_LENGTH = 1
 SEEDS = 5
 EPISODES = 1_000
 PAPER_EPISODES = 20
@@ -81,10 +71,8 @@ def train(run: pathlib.Path, steps: int, more: list[str]) -> int:
     """Train what is missing; the sweep's exit status."""
     return sweep.main(
         [
-            *("--preset", "rover", "--history-lengths", str(HISTORY_LENGTH)),
-            *("--seeds", str(SEEDS), "--total-steps", str(steps), "--out", str(run)),
-            *flags(SETTINGS),
-            *more,
+            *("--preset", "rover", "--seeds", str(SEEDS), "--total-steps", str(steps)),
+            *("--out", str(run), *more),
         ]
     )
 

@@ -4,13 +4,15 @@ import json
 
 import jax
 import numpy as np
+import pandas as pd
 import pytest
 
 from rtd3jax import sweep
 from rtd3jax.config import Config
 from rtd3jax.envs import registry
 from rtd3jax.study import recorder, references
-from rtd3jax.study.plan import PRESETS, Cell, make_cells
+from rtd3jax.study.plan import Cell, Grid, make_cells
+from rtd3jax.study.presets import PRESETS
 from rtd3jax.study.results import CURVES, EPISODES, read_table
 
 TINY = [
@@ -139,6 +141,35 @@ def test_presets_have_the_papers_cells():
     assert len(make_cells(PRESETS["rover"], {})) == 18
     # Four disturbances: five agents at five lengths and td3; three disturbances: two agents.
     assert len(make_cells(PRESETS["pendulum"], {})) == 4 * 26 + 3 * 10
+
+
+def test_presets_have_the_settings_that_were_searched():
+    assert {cell.config.total_steps for cell in make_cells(PRESETS["rover"], {})} == {80_000}
+    cells = make_cells(PRESETS["pendulum"], {})
+    assert {cell.config.gamma for cell in cells} == {0.97}
+    found = {cell.config.algorithm: cell.config for cell in cells}
+    own = {name: (config.policy_delay, config.total_steps) for name, config in found.items()}
+    assert own.pop("h-td3") == (4, 120_000)
+    assert set(own.values()) == {(2, 40_000)} and len(own) == 5
+    # What is said on the command line is for all of them.
+    given = make_cells(PRESETS["pendulum"], {"total_steps": 2_000, "policy_delay": 3})
+    assert {(c.config.total_steps, c.config.policy_delay) for c in given} == {(2_000, 3)}
+
+
+def test_a_study_may_hold_trainings_of_different_lengths(tmp_path, monkeypatch):
+    settings = {"total_steps": 40, "learning_starts": 10, "batch_size": 4, "hidden_size": 4}
+    tiny = {**settings, "eval_every": 20, "eval_episodes": 1}
+    grid = Grid(
+        "rover", ("ar1-slip",), ("td3", "h-td3"), (1,), tiny, {"h-td3": {"total_steps": 80}}
+    )
+    monkeypatch.setitem(PRESETS, "quick", (grid,))
+    run = tmp_path / "run"
+    command = ["--preset", "quick", "--seeds", "1", "--final-episodes", "1", "--out", str(run)]
+    assert sweep.main(command) == 0
+    curves = pd.read_parquet(run / "curves.parquet")
+    assert curves.groupby("algorithm")["step"].max().to_dict() == {"td3": 40, "h-td3": 80}
+    assert "- total_steps: 40 (td3); 80 (h-td3)\n" in (run / "summary.md").read_text()
+    assert sweep.main([*command, "--status"]) == 0
 
 
 def test_status_names_every_lane(tmp_path, capsys):

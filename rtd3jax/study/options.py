@@ -14,7 +14,8 @@ from rtd3jax.envs.registry import DISTURBANCES, ENVIRONMENTS
 from rtd3jax.errors import UserError
 from rtd3jax.study.command import add_import
 from rtd3jax.study.loggers import LOGGERS
-from rtd3jax.study.plan import PRESETS, Grid
+from rtd3jax.study.plan import Grid
+from rtd3jax.study.presets import PRESETS
 
 _GRID_FIELDS = ("algorithm", "history_length")
 
@@ -37,7 +38,9 @@ def parser(description: str | None) -> argparse.ArgumentParser:
         "      --disturbances random-sine noise --history-lengths 1 10 --seeds 5 --out runs/mine",
     )
     study = found.add_argument_group("the study")
-    study.add_argument("--preset", choices=sorted(PRESETS), help="a prepared study")
+    study.add_argument(
+        "--preset", choices=sorted(PRESETS), help="a prepared study, with its settings"
+    )
     study.add_argument(
         "--env", help=f"{', '.join(ENVIRONMENTS)}, a registered id, or any id that gymnax makes"
     )

@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 import time
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -26,8 +26,10 @@ class Grid:
     disturbances: tuple[str, ...]
     algorithms: tuple[str, ...]
     history_lengths: tuple[int, ...] = (10,)
-    settings: tuple[tuple[str, Any], ...] = ()
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Fields of the configuration that differ from the defaults."""
+    own_settings: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+    """Fields in which an algorithm differs from ``settings``, by its name."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,34 +74,6 @@ def label(job: Job) -> str:
 
 
 _OWN_FIELDS = ("env", "disturbance")
-ALL_AGENTS = tuple(VARIANTS)
-LENGTHS = (1, 3, 6, 10, 20)
-
-_ROVER = Grid("rover", ("ar1-slip", "sine-slip", "none"), ALL_AGENTS)
-_PENDULUM = (
-    Grid("pendulum", ("temporal-sine", "random-sine", "noise", "hidden"), ALL_AGENTS, LENGTHS),
-    Grid(
-        "pendulum",
-        ("none", "temporal-bias", "noise:sigma=1.0"),
-        ("lstm-td3", "lstm-td3-no-action"),
-        LENGTHS,
-    ),
-)
-PRESETS: dict[str, tuple[Grid, ...]] = {
-    "quick": (
-        Grid(
-            "rover",
-            ("ar1-slip",),
-            ("td3", "h-td3", "lstm-td3-1ha1hc"),
-            (2,),
-            (("total_steps", 8_000), ("hidden_size", 64), ("eval_every", 500)),
-        ),
-    ),
-    "rover": (_ROVER,),
-    "pendulum": _PENDULUM,
-    "paper": (_ROVER, *_PENDULUM),
-}
-"""quick: minutes on two cores; rover: the paper's rover table; pendulum: its benchmark figures."""
 
 
 def make_cells(grids: Iterable[Grid], overrides: dict[str, Any]) -> list[Cell]:
@@ -111,7 +85,8 @@ def make_cells(grids: Iterable[Grid], overrides: dict[str, Any]) -> list[Cell]:
             with warnings.catch_warnings():
                 # A list of lengths is for the agents that have windows; td3 runs once.
                 warnings.simplefilter("ignore")
-                settings = {**dict(grid.settings), **overrides}
+                own = grid.own_settings.get(algorithm, {})
+                settings = {**grid.settings, **own, **overrides}
                 config = Config(algorithm=algorithm, history_length=length, **settings)
             cells[Cell(grid.env, disturbance, config)] = None
     if not cells:

@@ -298,18 +298,22 @@ class RunDirectory:
             failures.append({**row, **failure})
 
     def _excerpt(self) -> dict[str, object]:
-        """What all cells have in common, for the summary."""
+        """What the cells have in common, and whose fields differ, for the summary."""
         dicts = [cell.to_dict() for cell in self.cells]
-        common = {
-            name: value
-            for name, value in dicts[0].items()
-            if all(other[name] == value for other in dicts)
-        }
+        fields = {}
+        for name in dicts[0]:
+            agents: dict[Any, dict[str, None]] = {}
+            for cell in dicts:
+                agents.setdefault(cell[name], {})[cell["algorithm"]] = None
+            if len(agents) == 1:
+                fields[name] = dicts[0][name]
+            elif name not in self.cells[0].key:  # those stand in the summary's tables
+                fields[name] = "; ".join(f"{v} ({', '.join(own)})" for v, own in agents.items())
         return {
             "cells": len(self.cells),
             "seeds": len(self.seeds),
             "final episodes per seed": self._study["final_episodes"],
-            **common,
+            **fields,
         }
 
 

@@ -1,0 +1,86 @@
+"""Prepared studies of the sweep: the paper's cells, with the settings that the evidence uses.
+
+The paper states no hyper-parameters. experiments/rover_search.py and experiments/pendulum_search.py
+found these, on seeds that are not reported; docs/what_the_paper_leaves_open.md says why they help.
+"""
+
+from typing import Any
+
+from rtd3jax.config import ALGORITHMS
+from rtd3jax.study.plan import Grid
+
+ROVER_STEPS = 80_000
+ROVER_HISTORY_LENGTH = 1
+ROVER_SETTINGS: dict[str, Any] = {
+    "gamma": 0.0,
+    "reward_scale": 10.0,
+    "critic_learning_rate": 3e-3,
+    "actor_learning_rate": 3e-3,
+    "final_learning_rate_fraction": 0.0,
+    "actor_noise": 0.1,
+    "update_every": 4,
+    "eval_every": 2_000,
+    "precision": "float32",
+}
+"""One setting for all agents."""
+
+PENDULUM_STEPS = 40_000
+PENDULUM_STEPS_FACTOR = {"h-td3": 3}
+PENDULUM_DISTURBANCES = ("temporal-sine", "random-sine", "noise", "hidden")
+ACTION_HISTORY_DISTURBANCES = ("none", "temporal-bias", "noise:sigma=1.0")
+"""Under which the paper compares `lstm-td3` with and without past actions, besides the others."""
+PENDULUM_HISTORY_LENGTHS = (1, 3, 6, 10, 20)
+PENDULUM_SETTINGS: dict[str, Any] = {
+    "critic_learning_rate": 3e-3,
+    "actor_learning_rate": 3e-4,
+    "final_learning_rate_fraction": 0.0,
+    "gamma": 0.97,
+    "reward_scale": 0.1,
+    "exploration_noise": 0.2,
+}
+PENDULUM_OWN_SETTINGS: dict[str, dict[str, Any]] = {
+    "h-td3": {"exploration_noise": 0.5, "replay_capacity": 20_000, "policy_delay": 4},
+}
+"""h-td3's critics read carries that an actor of long ago stored, and the actor moves on."""
+
+_ROVER = Grid(
+    "rover",
+    ("ar1-slip", "sine-slip", "none"),
+    ALGORITHMS,
+    (ROVER_HISTORY_LENGTH,),
+    {**ROVER_SETTINGS, "total_steps": ROVER_STEPS},
+)
+
+
+def _pendulum(disturbances: tuple[str, ...], algorithms: tuple[str, ...]) -> Grid:
+    own = {
+        name: {
+            **PENDULUM_OWN_SETTINGS.get(name, {}),
+            "total_steps": PENDULUM_STEPS * PENDULUM_STEPS_FACTOR.get(name, 1),
+        }
+        for name in ALGORITHMS
+    }
+    return Grid(
+        "pendulum", disturbances, algorithms, PENDULUM_HISTORY_LENGTHS, PENDULUM_SETTINGS, own
+    )
+
+
+_PENDULUM = (
+    _pendulum(PENDULUM_DISTURBANCES, ALGORITHMS),
+    _pendulum(ACTION_HISTORY_DISTURBANCES, ("lstm-td3", "lstm-td3-no-action")),
+)
+PRESETS: dict[str, tuple[Grid, ...]] = {
+    "quick": (
+        Grid(
+            "rover",
+            ("ar1-slip",),
+            ("td3", "h-td3", "lstm-td3-1ha1hc"),
+            (2,),
+            {"total_steps": 8_000, "hidden_size": 64, "eval_every": 500},
+        ),
+    ),
+    "rover": (_ROVER,),
+    "pendulum": _PENDULUM,
+    "paper": (_ROVER, *_PENDULUM),
+}
+"""quick: minutes on two cores; rover: the paper's rover table; pendulum: its benchmark figures."""
