@@ -188,11 +188,16 @@ def facts(lanes: pd.DataFrame, began: float) -> dict[str, object]:
 def draw(lanes: pd.DataFrame, path: pathlib.Path) -> None:
     """The paper's final returns against the agent: a panel per disturbance, dots are seeds."""
     names = [name for name in ALL_DISTURBANCES if (lanes["disturbance"] == name).any()]
-    figure = Figure(figsize=(2.6 * len(names) + 1.6, 3.4), layout="constrained")
-    panels = np.atleast_1d(figure.subplots(1, len(names), sharey=True))
-    for axes, name in zip(panels, names, strict=True):
+    columns = min(len(names), 4)
+    rows = -(-len(names) // columns)
+    figure = Figure(figsize=(2.6 * columns + 1.6, 3.4 * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, sharey=True, squeeze=False)
+    for axes in panels.flat[len(names) :]:
+        axes.axis("off")
+    for axes, name in zip(panels.flat, names, strict=False):
         here = lanes[lanes["disturbance"] == name]
-        for index, algorithm in enumerate(rtd.ALGORITHMS):
+        agents = [name for name in rtd.ALGORITHMS if (here["algorithm"] == name).any()]
+        for index, algorithm in enumerate(agents):
             own = here[here["algorithm"] == algorithm]
             lengths = sorted(own["history_length"].unique())
             for k, length in enumerate(lengths):
@@ -201,11 +206,13 @@ def draw(lanes: pd.DataFrame, path: pathlib.Path) -> None:
                 axes.plot([x] * len(values), values, ".", ms=4, color=COLOURS[algorithm], alpha=0.5)
                 axes.plot(x, values.mean(), "_", ms=9, mew=2, color=COLOURS[algorithm])
         axes.axhline(1.0, color="#777777", lw=0.8)
-        axes.set_xticks(range(len(rtd.ALGORITHMS)), rtd.ALGORITHMS, rotation=60, ha="right")
+        axes.set_xticks(range(len(agents)), agents, rotation=60, ha="right")
+        axes.set_xlim(-0.6, len(agents) - 0.4)
         steps = sorted(here["steps"].unique())
         axes.set_title(f"{name}\n{' and '.join(f'{n:,}' for n in steps)} steps", fontsize=10)
         axes.grid(axis="y", color="#E4E4E4", lw=0.6)
-    panels[0].set_ylabel("normalised return")
+    for axes in panels[:, 0]:
+        axes.set_ylabel("normalised return")
     figure.savefig(path, dpi=150)
 
 

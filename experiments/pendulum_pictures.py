@@ -4,9 +4,10 @@ Usage: python experiments/pendulum_pictures.py [--run DIR] [--disturbance D] [--
                                                [--seed N] [--agents A B] [--out DIR] [--quick]
 
 Loads two policies of one study of experiments/pendulum.py and lets them play the same twenty
-episodes; shown is the one in which their returns differ by the median. Writes pendulum_swing.gif:
-the pendulum as it is, the one that the sensors report, and what the disturbance does to the angular
-velocity's reading beneath.
+episodes; shown is the one in which their returns differ most nearly by the mean of the twenty (the
+median episode is one in which both do alike). Writes pendulum_swing.gif: the pendulum as it is, the
+one that the sensors report, and what the disturbance does to the angular velocity's reading
+beneath.
 """
 
 import argparse
@@ -84,7 +85,8 @@ def main(arguments: list[str] | None = None) -> int:
     if not plays:
         return 1
     returns = np.stack([play["reward"].sum(axis=(1, 2)) for play in plays.values()])
-    typical = np.argsort(returns[-1] - returns[0])[EPISODES // 2]
+    difference = returns[-1] - returns[0]
+    typical = np.abs(difference - difference.mean()).argmin()
     plays = {name: {k: v[typical] for k, v in play.items()} for name, play in plays.items()}
     options.out.mkdir(parents=True, exist_ok=True)
     animate(plays, options.out / "pendulum_swing.gif", 50 if options.quick else 2)
