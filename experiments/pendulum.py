@@ -196,7 +196,7 @@ def draw(lanes: pd.DataFrame, path: pathlib.Path) -> None:
         axes.axis("off")
     for axes, name in zip(panels.flat, names, strict=False):
         here = lanes[lanes["disturbance"] == name]
-        agents = [name for name in rtd.ALGORITHMS if (here["algorithm"] == name).any()]
+        agents = [agent for agent in rtd.ALGORITHMS if (here["algorithm"] == agent).any()]
         for index, algorithm in enumerate(agents):
             own = here[here["algorithm"] == algorithm]
             lengths = sorted(own["history_length"].unique())

@@ -4,8 +4,8 @@ Usage: python experiments/pendulum_pictures.py [--run DIR] [--disturbance D] [--
                                                [--seed N] [--agents A B] [--out DIR] [--quick]
 
 Loads two policies of one study of experiments/pendulum.py and lets them play the same twenty
-episodes; shown is the one in which their returns differ most nearly by the mean of the twenty (the
-median episode is one in which both do alike). Writes pendulum_swing.gif: the pendulum as it is, the
+episodes; shown is the one whose difference in returns is nearest to the mean difference (in the
+median episode both do alike). Writes pendulum_swing.gif: the pendulum as it is, the
 one that the sensors report, and what the disturbance does to the angular velocity's reading
 beneath.
 """

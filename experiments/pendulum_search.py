@@ -4,12 +4,12 @@ Usage: python experiments/pendulum_search.py [--quick] [--out FILE]
 
 One setting was sought for all agents, with the two that were furthest from the goal: `h-td3`, whose
 critics read carries that an actor of long ago stored, and `lstm-td3-no-action`, whose returns went
-up and down. What one of them needs costs the other, so there are two; pendulum_studies.py has them.
-Two seeds sufficed to tell these settings apart, not to tell how many seeds of `h-td3` would come
-to the goal: the settings compared last have four. Width 64, as the table has. Seeds from 100 on are
-not reported elsewhere. Writes experiments/results/pendulum_search.csv: a row per setting, with the
-final policies' normalised return over 400 episodes (200 in rows of two seeds). A setting whose row
-is there already is not trained again.
+up and down. What one of them needs costs the other, so there are two; the preset
+`pendulum` has them. Two seeds told the first six settings apart, not how many seeds of `h-td3`
+would come to the goal: those compared last have four. Width 64, as the table has. Seeds from 100 on
+are not reported elsewhere. Writes experiments/results/pendulum_search.csv: a row per setting, with
+the final policies' normalised return over 400 episodes (the kept rows of two seeds: 200). A setting
+whose row is there already is not trained again.
 """
 
 import pathlib

@@ -1,9 +1,9 @@
 """What experiments/pendulum.py trains: studies of the sweep, in folders of one directory.
 
 * ``main``: the agents that share a setting, under the paper's four disturbances;
-* ``h-td3``: the sixth agent, with more exploration, a shorter memory, a slower actor and more
-  steps. Its critics read carries that an actor of long ago stored, and its actor moves on
-  meanwhile;
+* ``h-td3``: the sixth agent, with more exploration, a shorter memory, a slower actor, slower
+  targets and more steps. Its critics read carries that an actor of long ago stored, and its actor
+  moves on meanwhile;
 * ``action-history``: `lstm-td3` with and without past actions, where the paper compares them.
 
 Their settings are those of the preset `pendulum`; experiments/pendulum_search.py found them, under

@@ -8,9 +8,9 @@ import pandas as pd
 import pytest
 
 from rtd3jax import sweep
-from rtd3jax.config import Config
+from rtd3jax.config import ALGORITHMS, Config
 from rtd3jax.envs import registry
-from rtd3jax.study import recorder, references
+from rtd3jax.study import presets, recorder, references
 from rtd3jax.study.plan import Cell, Grid, make_cells
 from rtd3jax.study.presets import PRESETS
 from rtd3jax.study.results import CURVES, EPISODES, read_table
@@ -115,6 +115,7 @@ def test_a_lost_lane_is_reported_and_the_exit_status_says_so(tmp_path, capsys):
         ("--preset quick --device gpu", "--device gpu: there is none here"),
         ("--preset quick --hidden-size 200000", "one lane needs"),
         ("--preset quick --history-lengths 0", "history_length must be at least 1"),
+        ("--preset rover --env pendulum", "has settings for rover"),
     ],
 )
 def test_bad_input_is_one_line(arguments, message, capsys, tmp_path):
@@ -144,19 +145,25 @@ def test_presets_have_the_papers_cells():
 
 
 def test_presets_have_the_settings_that_were_searched():
-    assert {cell.config.total_steps for cell in make_cells(PRESETS["rover"], {})} == {80_000}
-    cells = make_cells(PRESETS["pendulum"], {})
-    assert {cell.config.gamma for cell in cells} == {0.97}
-    found = {cell.config.algorithm: cell.config for cell in cells}
-    own = {name: (config.policy_delay, config.total_steps) for name, config in found.items()}
-    assert own.pop("h-td3") == (4, 120_000)
-    assert set(own.values()) == {(2, 40_000)} and len(own) == 5
-    # What is said on the command line is for all of them.
-    given = make_cells(PRESETS["pendulum"], {"total_steps": 2_000, "policy_delay": 3})
-    assert {(c.config.total_steps, c.config.policy_delay) for c in given} == {(2_000, 3)}
+    def settings(preset, algorithm, **overrides):
+        cells = make_cells(PRESETS[preset], overrides)
+        return [cell.config.to_dict() for cell in cells if cell.config.algorithm == algorithm]
+
+    for algorithm in ALGORITHMS:
+        rover = {**presets.ROVER_SETTINGS, "total_steps": 80_000}
+        length = {"history_length": 0 if algorithm == "td3" else 1}
+        assert len(settings("rover", algorithm)) == 3
+        assert all(found | rover | length == found for found in settings("rover", algorithm))
+        pendulum = {**presets.PENDULUM_SETTINGS, "total_steps": 40_000}
+        if algorithm == "h-td3":
+            pendulum |= {"exploration_noise": 0.5, "policy_delay": 4, "total_steps": 120_000}
+        assert all(found | pendulum == found for found in settings("pendulum", algorithm))
+        # What is said on the command line is for all of them.
+        given = {"total_steps": 2_000, "policy_delay": 3}
+        assert all(f | given == f for f in settings("pendulum", algorithm, **given))
 
 
-def test_a_study_may_hold_trainings_of_different_lengths(tmp_path, monkeypatch):
+def test_a_study_may_hold_trainings_of_different_lengths(tmp_path, capsys, monkeypatch):
     settings = {"total_steps": 40, "learning_starts": 10, "batch_size": 4, "hidden_size": 4}
     tiny = {**settings, "eval_every": 20, "eval_episodes": 1}
     grid = Grid(
@@ -169,7 +176,10 @@ def test_a_study_may_hold_trainings_of_different_lengths(tmp_path, monkeypatch):
     curves = pd.read_parquet(run / "curves.parquet")
     assert curves.groupby("algorithm")["step"].max().to_dict() == {"td3": 40, "h-td3": 80}
     assert "- total_steps: 40 (td3); 80 (h-td3)\n" in (run / "summary.md").read_text()
+    capsys.readouterr()
     assert sweep.main([*command, "--status"]) == 0
+    status = capsys.readouterr().out.splitlines()
+    assert [line.split()[-2:] for line in status[:2]] == [["done", "40"], ["done", "80"]]
 
 
 def test_status_names_every_lane(tmp_path, capsys):

@@ -115,6 +115,12 @@ def grids(options: argparse.Namespace) -> list[Grid]:
         found = [Grid(options.env, ("none",), ALGORITHMS)]
     else:
         found = list(PRESETS[options.preset])
+        worlds = list(dict.fromkeys(grid.env for grid in found))
+        if options.env is not None and worlds != [options.env]:
+            raise UserError(
+                f"--preset {options.preset} has settings for {' and '.join(worlds)}; leave out "
+                f"--env {options.env}, or the preset"
+            )
     given = {
         "env": options.env,
         "disturbances": options.disturbances and tuple(options.disturbances),

@@ -97,15 +97,20 @@ def make_cells(grids: Iterable[Grid], overrides: dict[str, Any]) -> list[Cell]:
 def cell_jobs(cells: Sequence[Cell], seeds: Sequence[int], strategy: str) -> list[Job]:
     """A job per cell and seed, owned by ``(cell, seed)``.
 
-    Side by side (``vmap``), all history lengths share the longest one's program: there a wider
-    product is nearly free. One by one (``map``), each length has a program of its own.
+    Side by side (``vmap``), all history lengths in a world share the longest one's program: there a
+    wider product is nearly free. One by one (``map``), each length has a program of its own.
     """
-    longest = max(cell.config.history_length or 0 for cell in cells)
-    window = longest if strategy == "vmap" and longest else None
+    longest: dict[str, int] = {}
+    for cell in cells:
+        longest[cell.env] = max(longest.get(cell.env, 0), cell.config.history_length or 0)
+
+    def window(cell: Cell) -> int | None:
+        return (longest[cell.env] or None) if strategy == "vmap" else None
+
     return [
         job
         for cell in cells
-        for job in make_jobs(cell.make_env(), cell.config, seeds, cell=cell, window=window)
+        for job in make_jobs(cell.make_env(), cell.config, seeds, cell=cell, window=window(cell))
     ]
 
 

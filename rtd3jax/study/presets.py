@@ -1,4 +1,4 @@
-"""Prepared studies of the sweep: the paper's cells, with the settings that the evidence uses.
+"""Prepared studies of the sweep: a quick one, and the paper's with the evidence's settings.
 
 The paper states no hyper-parameters. experiments/rover_search.py and experiments/pendulum_search.py
 found these, on seeds that are not reported; docs/what_the_paper_leaves_open.md says why they help.

@@ -9,7 +9,7 @@ import dataclasses
 import json
 import platform
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -302,19 +302,27 @@ class RunDirectory:
         dicts = [cell.to_dict() for cell in self.cells]
         fields = {}
         for name in dicts[0]:
-            agents: dict[Any, dict[str, None]] = {}
-            for cell in dicts:
-                agents.setdefault(cell[name], {})[cell["algorithm"]] = None
-            if len(agents) == 1:
+            if len({cell[name] for cell in dicts}) == 1:
                 fields[name] = dicts[0][name]
             elif name not in self.cells[0].key:  # those stand in the summary's tables
-                fields[name] = "; ".join(f"{v} ({', '.join(own)})" for v, own in agents.items())
+                fields[name] = _whose(name, dicts)
         return {
             "cells": len(self.cells),
             "seeds": len(self.seeds),
             "final episodes per seed": self._study["final_episodes"],
             **fields,
         }
+
+
+def _whose(name: str, cells: Sequence[Mapping[str, Any]]) -> str:
+    """The values of a field in which cells differ, and whose they are: the world's, the agent's."""
+    within = {env: {c[name] for c in cells if c["env"] == env} for env in (c["env"] for c in cells)}
+    owners: dict[Any, dict[str, None]] = {}
+    for cell in cells:
+        env, algorithm = cell["env"], cell["algorithm"]
+        one = f"{env}: {algorithm}" if len(within) > 1 else algorithm
+        owners.setdefault(cell[name], {})[env if len(within[env]) == 1 else one] = None
+    return "; ".join(f"{value} ({', '.join(own)})" for value, own in owners.items())
 
 
 def _is_own(entry: Path) -> bool:

@@ -1,4 +1,4 @@
-"""The operations that a plan and the benchmark count are those that XLA counts."""
+"""A plan's programs; the operations that it and the benchmark count are those that XLA counts."""
 
 import dataclasses
 import types
@@ -11,7 +11,8 @@ from rtd3jax.agents import lstm, td3
 from rtd3jax.agents.replay import empty_replay, gather
 from rtd3jax.agents.variants import VARIANTS
 from rtd3jax.config import Config
-from rtd3jax.study.plan import update_flops
+from rtd3jax.study.plan import Grid, cell_jobs, make_cells, update_flops
+from rtd3jax.study.rundir import _whose
 
 
 def _unrolled(f, carry, xs, reverse=False):
@@ -74,3 +75,26 @@ def test_operations_are_those_that_xla_counts(algorithm, monkeypatch):
         )
         ratio = _counted(algorithm, length, width, batch_size) / update_flops(config)
         assert 1.0 <= ratio <= 1.0 + left_out, (width, ratio)
+
+
+def test_side_by_side_a_world_has_the_windows_of_its_own_longest():
+    settings = {"total_steps": 40, "learning_starts": 10, "batch_size": 4, "hidden_size": 4}
+    grids = [
+        Grid("rover", ("none",), ("lstm-td3",), (1, 2), settings),
+        Grid("pendulum", ("none",), ("lstm-td3",), (3, 5), settings),
+    ]
+    for strategy, tokens in (("vmap", [2, 2, 5, 5]), ("map", [1, 2, 3, 5])):
+        jobs = cell_jobs(make_cells(grids, {}), [0], strategy)
+        assert [job.program.tokens for job in jobs] == tokens
+
+
+def test_fields_in_which_cells_differ_have_their_owners():
+    def cells(env, algorithms, **fields):
+        return [{"env": env, "algorithm": algorithm, **fields} for algorithm in algorithms]
+
+    agents = ("td3", "h-td3")
+    found = cells("rover", agents, gamma=0.0) + cells("pendulum", agents[:1], gamma=0.9)
+    found += cells("pendulum", agents[1:], gamma=0.99)
+    said = "0.0 (rover); 0.9 (pendulum: td3); 0.99 (pendulum: h-td3)"
+    assert _whose("gamma", found) == said
+    assert _whose("gamma", found[2:]) == "0.9 (td3); 0.99 (h-td3)"
