@@ -120,6 +120,15 @@ def test_the_pendulums_claims_follow_from_its_tables(tmp_path):
     assert verdicts[9] in ("undecided", "contradicted")
     assert set(verdicts[[1, 2, 10, 11, 12]]) == {"undecided"}
 
+    # What sigma does is not read off trainings of different lengths.
+    large = [{**lane, "disturbance": "noise:sigma=1.0", "normalised": 0.1} for lane in lanes]
+    for steps, verdict in ((40, "supported"), (20, "undecided")):
+        rows = [{**lane, "steps": 40} for lane in lanes] + [{**r, "steps": steps} for r in large]
+        pd.DataFrame(rows).to_parquet(tmp_path / "pendulum.parquet")
+        claims.main(["--results", str(tmp_path), "--out", str(tmp_path)])
+        found = pd.read_parquet(tmp_path / "claims.parquet").set_index("claim")["verdict"]
+        assert found[5] == verdict
+
 
 def test_the_pendulum_experiment_runs(tmp_path, capsys, monkeypatch):
     pendulum = load(EXPERIMENTS / "pendulum.py")
