@@ -28,21 +28,13 @@ from matplotlib.figure import Figure
 import rtd3jax as rtd
 from rtd3jax.envs.registry import parse_disturbance
 from rtd3jax.errors import UserError
+from rtd3jax.study import presets
 from rtd3jax.study.figures import COLOURS
-from rtd3jax.study.presets import PENDULUM_HISTORY_LENGTHS, PENDULUM_STEPS
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.transfer import transfer
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-from pendulum_studies import (  # noqa: E402
-    DISTURBANCES,
-    OF_ACTION_HISTORY,
-    OWN_SETTINGS,
-    SETTINGS,
-    current_setting,
-    settings_of,
-    studies,
-)
+from pendulum_studies import current_setting, settings_of, studies  # noqa: E402
 from settings import mark, notes, setting_text  # noqa: E402
 from writing import (  # noqa: E402
     RESULTS,
@@ -60,7 +52,7 @@ CONDITIONS = (
     "noise:sigma=1.0",
 )
 """Under which agents of `random-sine` are tested (the paper's generalisation figure)."""
-ALL_DISTURBANCES = (*DISTURBANCES, *OF_ACTION_HISTORY)
+ALL_DISTURBANCES = (*presets.PENDULUM_DISTURBANCES, *presets.ACTION_HISTORY_DISTURBANCES)
 TEST_EPISODES = 1_000
 EARLIER_EPISODES = 20
 """Of rows in a table that did not say yet."""
@@ -178,8 +170,8 @@ def facts(lanes: pd.DataFrame, began: float) -> dict[str, object]:
         steps=of_each(lanes, "steps"),
         width=of_each(lanes, "width"),
         episodes=of_each(lanes, "episodes"),
-        setting_where_not_marked=setting_text(SETTINGS),
-        and_besides=OWN_SETTINGS,
+        setting_where_not_marked=setting_text(presets.PENDULUM_SETTINGS),
+        and_besides=presets.PENDULUM_OWN_SETTINGS,
         precision=rtd.Config.precision,
         minutes_of_the_last_call=round((time.time() - began) / 60, 1),
     )
@@ -255,10 +247,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--run", type=pathlib.Path, default=pathlib.Path("runs/pendulum"))
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
     parser.add_argument(
-        "--steps", type=int, default=PENDULUM_STEPS, help="h-td3 has three times as many"
+        "--steps", type=int, default=presets.PENDULUM_STEPS, help="h-td3 has three times as many"
     )
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--lengths", type=int, nargs="+", default=[*PENDULUM_HISTORY_LENGTHS])
+    parser.add_argument(
+        "--lengths", type=int, nargs="+", default=[*presets.PENDULUM_HISTORY_LENGTHS]
+    )
     parser.add_argument("--width", type=int, default=128)
     parser.add_argument("--disturbances", nargs="+", metavar="D", default=[], help="no others")
     parser.add_argument("--algorithms", nargs="+", metavar="A", default=list(rtd.ALGORITHMS))

@@ -18,16 +18,12 @@ from collections.abc import Sequence
 from settings import flags, setting_text
 
 from rtd3jax import sweep
-from rtd3jax.study.presets import ACTION_HISTORY_DISTURBANCES as OF_ACTION_HISTORY
-from rtd3jax.study.presets import PENDULUM_DISTURBANCES as DISTURBANCES
-from rtd3jax.study.presets import PENDULUM_OWN_SETTINGS as OWN_SETTINGS
-from rtd3jax.study.presets import PENDULUM_SETTINGS as SETTINGS
-from rtd3jax.study.presets import PENDULUM_STEPS_FACTOR as STEPS_FACTOR
+from rtd3jax.study import presets
 
 
 def settings_of(algorithm: str) -> dict[str, object]:
     """Fields of the configuration in which the agent differs from the defaults."""
-    return {**SETTINGS, **OWN_SETTINGS.get(algorithm, {})}
+    return {**presets.PENDULUM_SETTINGS, **presets.PENDULUM_OWN_SETTINGS.get(algorithm, {})}
 
 
 def current_setting(algorithm: str) -> str:
@@ -49,7 +45,7 @@ class Study:
         assert len({current_setting(name) for name in self.algorithms}) == 1
         settings = {
             **settings_of(first),
-            "total_steps": options.steps * STEPS_FACTOR.get(first, 1),
+            "total_steps": options.steps * presets.PENDULUM_STEPS_FACTOR.get(first, 1),
             "hidden_size": options.width,
         }
         lengths = map(str, options.lengths)
@@ -64,13 +60,13 @@ class Study:
 
 def studies(disturbances: Sequence[str], algorithms: Sequence[str]) -> list[Study]:
     """Those of the given agents; without ``disturbances``, under the paper's."""
-    given = tuple(disturbances) or DISTURBANCES
-    together = tuple(name for name in algorithms if name not in OWN_SETTINGS)
-    alone = [name for name in algorithms if name in OWN_SETTINGS]
+    given = tuple(disturbances) or presets.PENDULUM_DISTURBANCES
+    together = tuple(name for name in algorithms if name not in presets.PENDULUM_OWN_SETTINGS)
+    alone = [name for name in algorithms if name in presets.PENDULUM_OWN_SETTINGS]
     found = [Study(name, given, (name,)) for name in alone]
     if together:
         found.insert(0, Study("main", given, together))
     compared = tuple(name for name in ("lstm-td3", "lstm-td3-no-action") if name in algorithms)
     if compared and not disturbances:
-        found.append(Study("action-history", OF_ACTION_HISTORY, compared))
+        found.append(Study("action-history", presets.ACTION_HISTORY_DISTURBANCES, compared))
     return found

@@ -122,12 +122,11 @@ def grids(options: argparse.Namespace) -> list[Grid]:
                 f"--env {options.env}, or the preset"
             )
     given = {
-        "env": options.env,
         "disturbances": options.disturbances and tuple(options.disturbances),
         "algorithms": options.algorithms and tuple(options.algorithms),
         "history_lengths": options.history_lengths and tuple(options.history_lengths),
     }
-    changes = {name: value for name, value in given.items() if value is not None}
+    changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     return [dataclasses.replace(grid, **changes) for grid in found]
 
 

@@ -101,16 +101,15 @@ def cell_jobs(cells: Sequence[Cell], seeds: Sequence[int], strategy: str) -> lis
     wider product is nearly free. One by one (``map``), each length has a program of its own.
     """
     longest: dict[str, int] = {}
-    for cell in cells:
-        longest[cell.env] = max(longest.get(cell.env, 0), cell.config.history_length or 0)
-
-    def window(cell: Cell) -> int | None:
-        return (longest[cell.env] or None) if strategy == "vmap" else None
-
+    if strategy == "vmap":
+        for cell in cells:
+            longest[cell.env] = max(longest.get(cell.env, 0), cell.config.history_length or 0)
     return [
         job
         for cell in cells
-        for job in make_jobs(cell.make_env(), cell.config, seeds, cell=cell, window=window(cell))
+        for job in make_jobs(
+            cell.make_env(), cell.config, seeds, cell=cell, window=longest.get(cell.env) or None
+        )
     ]
 
 

@@ -53,16 +53,12 @@ _ROVER = Grid(
 
 
 def _pendulum(disturbances: tuple[str, ...], algorithms: tuple[str, ...]) -> Grid:
+    settings = {**PENDULUM_SETTINGS, "total_steps": PENDULUM_STEPS}
     own = {
-        name: {
-            **PENDULUM_OWN_SETTINGS.get(name, {}),
-            "total_steps": PENDULUM_STEPS * PENDULUM_STEPS_FACTOR.get(name, 1),
-        }
-        for name in ALGORITHMS
+        name: {**fields, "total_steps": PENDULUM_STEPS * PENDULUM_STEPS_FACTOR[name]}
+        for name, fields in PENDULUM_OWN_SETTINGS.items()
     }
-    return Grid(
-        "pendulum", disturbances, algorithms, PENDULUM_HISTORY_LENGTHS, PENDULUM_SETTINGS, own
-    )
+    return Grid("pendulum", disturbances, algorithms, PENDULUM_HISTORY_LENGTHS, settings, own)
 
 
 _PENDULUM = (

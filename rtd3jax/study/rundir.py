@@ -316,7 +316,9 @@ class RunDirectory:
 
 def _whose(name: str, cells: Sequence[Mapping[str, Any]]) -> str:
     """The values of a field in which cells differ, and whose they are: the world's, the agent's."""
-    within = {env: {c[name] for c in cells if c["env"] == env} for env in (c["env"] for c in cells)}
+    within: dict[str, set[Any]] = {}
+    for cell in cells:
+        within.setdefault(cell["env"], set()).add(cell[name])
     owners: dict[Any, dict[str, None]] = {}
     for cell in cells:
         env, algorithm = cell["env"], cell["algorithm"]
