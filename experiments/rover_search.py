@@ -25,6 +25,7 @@ BASE = {
     "seeds": 2,
     "train_on": "ar1-slip",
     "history_length": 1,
+    "hidden_size": 128,
     "total_steps": 20_000,
     "batch_size": 100,
     "learning_rate": 1e-3,
@@ -156,13 +157,12 @@ CHANGES: tuple[dict, ...] = (
 """What each setting changes in `BASE`."""
 
 
-def search(setting: dict, width: int, episodes: int) -> dict:
+def search(setting: dict, episodes: int) -> dict:
     """Train the setting and evaluate it under nominal slip; the results of a row."""
     began = time.perf_counter()
     fields = {name: value for name, value in setting.items() if name in RTD_FIELDS}
     config = rtd.Config(
         algorithm="lstm-td3-1ha1hc",
-        hidden_size=width,
         actor_learning_rate=setting["learning_rate"] * setting["actor_rate"],
         critic_learning_rate=setting["learning_rate"],
         **fields,
@@ -186,7 +186,7 @@ RTD_FIELDS = set(BASE) - {"seeds", "train_on", "learning_rate", "actor_rate"}
 
 
 def main(arguments: list[str] | None = None) -> None:
-    search_main(arguments, __doc__, RESULTS, BASE, CHANGES, search, width=128, episodes=1_000)
+    search_main(arguments, __doc__, RESULTS, BASE, CHANGES, search, episodes=1_000)
 
 
 if __name__ == "__main__":

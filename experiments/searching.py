@@ -33,11 +33,10 @@ def search_main(
     results: pathlib.Path,
     base: dict,
     changes: Sequence[dict],
-    search: Callable[[dict, int, int], dict],
-    width: int,
+    search: Callable[[dict, int], dict],
     episodes: int,
 ) -> None:
-    """The command line of a search: ``search(setting, width, episodes)`` for each of ``changes``.
+    """The command line of a search: ``search(setting, episodes)`` for each of ``changes``.
 
     With ``--quick`` the first two, tiny.
     """
@@ -47,10 +46,11 @@ def search_main(
     options = parser.parse_args(arguments)
     tiny = {}
     if options.quick:
-        tiny, changes, width, episodes = {"total_steps": 1_200}, changes[:2], 8, 10
+        tiny = {"total_steps": 1_200, "hidden_size": 8}
+        changes, episodes = changes[:2], 10
     go_through(
         ({**base, **change, **tiny} for change in changes),
-        lambda setting: search(setting, width, episodes),
+        lambda setting: search(setting, episodes),
         options.out,
         base,
     )

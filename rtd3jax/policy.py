@@ -23,8 +23,10 @@ from rtd3jax.errors import UserError
 from rtd3jax.files import array_bytes, check_target, flatten, write_new
 from rtd3jax.versions import versions_of
 
-FORMAT = 1
-"""Of saved policies; raised when older versions could not read them."""
+FORMAT = 2
+"""Of saved policies; raised when older versions could not read them.
+
+Actors of format 1 read actions in the environment's units."""
 
 KIND = "policy"
 
@@ -35,7 +37,7 @@ class PolicyState:
 
     Attributes:
         steps: ring of the last L steps.
-        previous_action: [A], zero before the first step.
+        previous_action: [A], as tokens hold it; zero before the first step.
         time: int32 [], steps done in the episode.
     """
 
@@ -50,8 +52,10 @@ class Policy:
 
     Attributes:
         actor: the actor's parameters.
-        bounds: the action's range.
+        bounds: the range of the environment's action.
         history_length: int32 [], l.
+        centre_token: [A], what tokens hold for an action at the centre of its range: zero, but in
+            policies of format 1 the centre in half ranges.
         algorithm: the agent's id.
         tokens: past tokens in the window's arrays, at least l.
         observation_size: O.
@@ -61,6 +65,7 @@ class Policy:
     actor: Params
     bounds: Bounds
     history_length: jax.Array
+    centre_token: jax.Array
     algorithm: str = struct.field(pytree_node=False)
     tokens: int = struct.field(pytree_node=False)
     observation_size: int = struct.field(pytree_node=False)
@@ -95,10 +100,11 @@ class Policy:
             observation=observation[None],
             previous_action=state.previous_action[None],
         )
-        action = act(self.actor, VARIANTS[self.algorithm], window, self.bounds)[0]
-        steps = put_step(state.steps, state.time, Steps(observation, state.previous_action, action))
-        state = PolicyState(steps, action, state.time + jnp.int32(1))
-        return action.reshape(self.action_shape), state
+        action = act(self.actor, VARIANTS[self.algorithm], window)[0]
+        token = action + self.centre_token
+        steps = put_step(state.steps, state.time, Steps(observation, state.previous_action, token))
+        state = PolicyState(steps, token, state.time + jnp.int32(1))
+        return self.bounds.to_environment(action).reshape(self.action_shape), state
 
     def save(self, path: str | os.PathLike, overwrite: bool = False) -> None:
         """Write the policy to a safetensors file, for `rtd3jax.load_policy`.
@@ -132,7 +138,7 @@ class Policy:
             history_length=int(self.history_length),
             observation_size=self.observation_size,
             action_shape=self.action_shape,
-            arrays=fold(actor, self.bounds.low, self.bounds.high),
+            arrays=fold(actor, self.bounds.low, self.bounds.high, self.centre_token),
             about=self._about(),
         )
         write_new(path, content_of(model), overwrite)
@@ -158,6 +164,7 @@ class Policy:
             "action_shape": list(self.action_shape),
             "action_low": np.asarray(self.bounds.low).tolist(),
             "action_high": np.asarray(self.bounds.high).tolist(),
+            "centre_token": np.asarray(self.centre_token).tolist(),
             "hidden_size": int(self.actor["head"]["bias"].shape[-1]),
             "versions": versions_of(("rtd3jax", "jax", "jaxlib", "numpy")),
         }

@@ -10,14 +10,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rtd3jax.agents.networks import init_network, part_sizes
+from rtd3jax.agents.networks import Params, init_network, part_sizes
 from rtd3jax.agents.td3 import Bounds
-from rtd3jax.agents.variants import VARIANTS
+from rtd3jax.agents.variants import VARIANTS, NetworkSpec
 from rtd3jax.config import ALGORITHMS
 from rtd3jax.envs.interface import Interface
 from rtd3jax.errors import UserError
 from rtd3jax.files import flatten, read_arrays, unflatten
 from rtd3jax.policy import FORMAT, KIND, Policy
+
+_FORMATS = (1, FORMAT)
+_ACTIONS = ("action", "previous_action")
 
 
 def read_policy(path: str | os.PathLike) -> Policy:
@@ -35,9 +38,10 @@ def read_policy(path: str | os.PathLike) -> Policy:
         )
     if not isinstance(about, dict) or about.get("kind") != KIND:
         raise UserError(f"{path} is not a saved policy")
-    if about.get("format") != FORMAT:
+    if about.get("format") not in _FORMATS:
         raise UserError(
-            f"{path} has format {about.get('format')}, and this version of rtd3jax reads {FORMAT}: "
+            f"{path} has format {about.get('format')}, and this version of rtd3jax reads up to "
+            f"{FORMAT}: "
             "use the version that wrote it, or a newer one"
         )
     interface, facts = _header(path, about)
@@ -52,6 +56,8 @@ def restore_policy(
     algorithm: str,
     history_length: int,
     width: int,
+    format: int = FORMAT,
+    centre_token: np.ndarray | None = None,
 ) -> Policy:
     """The policy of an actor's arrays under dotted names.
 
@@ -62,6 +68,8 @@ def restore_policy(
         algorithm: the agent's id.
         history_length: l; 0 for td3.
         width: H.
+        format: of the file; an actor of format 1 is converted.
+        centre_token: [A], as in the policy; zero by default.
 
     Raises:
         UserError: when an array is missing, too many, of another shape or type, or not finite.
@@ -90,15 +98,40 @@ def restore_policy(
             raise UserError(f"{path}: {name} is {array.dtype}, not float32")
         if not np.all(np.isfinite(array)):
             raise UserError(f"{path}: the weights are not finite ({name})")
+    bounds = Bounds(jnp.asarray(interface.action_low), jnp.asarray(interface.action_high))
+    if centre_token is None:
+        centre_token = np.zeros(interface.action_size, np.float32)
+    tree = unflatten(actor)
+    if format == 1:
+        tree = _in_half_ranges(tree, spec, sizes, np.asarray(bounds.half_range))
+        centre_token = np.asarray(bounds.centre / bounds.half_range)
     return Policy(
-        actor=jax.tree.map(jnp.asarray, unflatten(actor)),
-        bounds=Bounds(jnp.asarray(interface.action_low), jnp.asarray(interface.action_high)),
+        actor=jax.tree.map(jnp.asarray, tree),
+        bounds=bounds,
         history_length=jnp.int32(history_length),
+        centre_token=jnp.asarray(centre_token),
         algorithm=algorithm,
         tokens=history_length,
         observation_size=interface.observation_size,
         action_shape=interface.action_shape,
     )
+
+
+def _in_half_ranges(
+    actor: Params, spec: NetworkSpec, sizes: dict[str, int], half_range: np.ndarray
+) -> Params:
+    """An actor that read actions in the environment's units, as one that reads half ranges.
+
+    A product with an action is one with the action in half ranges and weights times ``half_range``
+    [A].
+    """
+    actor = dict(actor)
+    for layer, parts in (("encoder", spec.memory), ("current", spec.current)):
+        if parts:
+            scales = [half_range if p in _ACTIONS else np.ones(sizes[p]) for p in parts]
+            column = np.concatenate(scales).astype(np.float32)[:, None]
+            actor[layer] = {**actor[layer], "kernel": column * actor[layer]["kernel"]}
+    return actor
 
 
 def _header(path: str | os.PathLike, about: dict[str, Any]) -> tuple[Interface, dict[str, Any]]:
@@ -122,8 +155,13 @@ def _header(path: str | os.PathLike, about: dict[str, Any]) -> tuple[Interface, 
     fit = low.shape == high.shape == (size,) and np.all(np.isfinite([low, high]))
     if not fit or not np.all(low < high):
         raise UserError(f"{wrong} action bounds are not {size} pairs of low < high")
+    centre_token = np.asarray(about.get("centre_token", np.zeros(size)), np.float32)
+    if centre_token.shape != (size,) or not np.all(np.isfinite(centre_token)):
+        raise UserError(f"{wrong} centre_token is not {size} numbers")
     interface = Interface(about["observation_size"], tuple(shape), size, low, high)
     return interface, {
+        "format": about["format"],
+        "centre_token": centre_token,
         "algorithm": algorithm,
         "history_length": about["history_length"],
         "width": about["hidden_size"],

@@ -35,6 +35,7 @@ def random_policy(algorithm, env, *, width=8, length=LENGTH, seed=0, scale=3.0):
         actor=actor,
         bounds=Bounds(jnp.asarray(interface.action_low), jnp.asarray(interface.action_high)),
         history_length=jnp.int32(length),
+        centre_token=jnp.zeros(interface.action_size),
         algorithm=algorithm,
         tokens=length + 2 * bool(length),  # as where lanes of several lengths share a program
         observation_size=interface.observation_size,

@@ -66,6 +66,7 @@ def test_a_recurrent_policy_plays_with_its_window():
         actor=init_learner(jax.random.key(0), VARIANTS["lstm-td3-1ha1hc"], 3, 1, 8).actor,
         bounds=Bounds(jnp.array([-2.0]), jnp.array([2.0])),
         history_length=jnp.int32(2),
+        centre_token=jnp.zeros(1),
         algorithm="lstm-td3-1ha1hc",
         tokens=2,
         observation_size=3,

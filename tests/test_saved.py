@@ -51,7 +51,7 @@ def test_the_header_is_json_that_anyone_can_read(tmp_path, policy):
     about = json.loads(header["__metadata__"]["rtd3jax"])["about"]
     assert about["algorithm"] == "lstm-td3" and about["history_length"] == 3
     assert about["action_low"] == [-1.0, -1.0] and about["action_high"] == [1.0, 1.0]
-    assert about["observation_size"] == 2 and about["hidden_size"] == 8 and about["format"] == 1
+    assert about["observation_size"] == 2 and about["hidden_size"] == 8 and about["format"] == 2
     assert about["versions"]["jax"] == jax.__version__
 
 
@@ -111,7 +111,8 @@ def test_arrays_that_do_not_fit_are_refused(tmp_path, policy, change, message):
 @pytest.mark.parametrize(
     "changes, message",
     [
-        ({"format": 2}, "has format 2, .* reads 1"),
+        ({"format": 3}, "has format 3, .* reads up to 2"),
+        ({"centre_token": [0.0]}, "centre_token is not 2 numbers"),
         ({"kind": "shopping list"}, "is not a saved policy"),
         ({"algorithm": "ppo"}, "algorithm is 'ppo'"),
         ({"history_length": 0}, "history_length is 0"),

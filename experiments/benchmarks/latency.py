@@ -45,6 +45,7 @@ def policy_of(algorithm, length, width):
         actor=actor,
         bounds=Bounds(jnp.full(ACTIONS, -2.0), jnp.full(ACTIONS, 2.0)),
         history_length=jnp.int32(length),
+        centre_token=jnp.zeros(ACTIONS),
         algorithm=algorithm,
         tokens=length,
         observation_size=OBSERVATIONS,

@@ -112,8 +112,6 @@ class Learner:
         action_size: int,
         width: int,
         *,
-        low: float = -1.0,
-        high: float = 1.0,
         gamma: float = 0.99,
         tau: float = 0.005,
         learning_rate: float = 1e-3,
@@ -127,7 +125,6 @@ class Learner:
         self.target_actor = copy.deepcopy(self.actor)
         self.target_critics = copy.deepcopy(self.critics)
         self._gamma, self._tau, self._noise, self._clip = gamma, tau, noise, noise_clip
-        self._low, self._high = low, high
         self._actor_weights = list(self.actor.parameters())
         self._critic_weights = list(self.critics.parameters())
         self._online = self._actor_weights + self._critic_weights
@@ -136,17 +133,15 @@ class Learner:
         self._critic_adam = torch.optim.Adam(self._critic_weights, learning_rate, fused=True)
 
     def act(self, actor: Network, window: Window, carry: Carry | None = None) -> torch.Tensor:
-        """The greedy action [B, A]."""
-        centre, half = 0.5 * (self._high + self._low), 0.5 * (self._high - self._low)
-        return centre + half * torch.tanh(actor(window, carry=carry))
+        """The greedy action [B, A], in half ranges."""
+        return torch.tanh(actor(window, carry=carry))
 
     @torch.no_grad()
     def target(self, batch: Batch, gaussian: torch.Tensor) -> torch.Tensor:
         """y [B], with ``gaussian`` [B, A] for the smoothing noise."""
-        half = 0.5 * (self._high - self._low)
-        noise = (self._noise * gaussian).clamp_(-self._clip, self._clip) * half
+        noise = (self._noise * gaussian).clamp_(-self._clip, self._clip)
         action = self.act(self.target_actor, batch.next_window).add_(noise)
-        action.clamp_(self._low, self._high)
+        action.clamp_(-1.0, 1.0)
         first, second = (
             critic(batch.next_window, action, batch.next_carry)[:, 0]
             for critic in self.target_critics

@@ -1,6 +1,8 @@
 """TD3's targets, losses and updates (Fujimoto et al., 2018), over any of the six agents.
 
-Shapes: ``B`` batch, ``A`` action elements.
+Actions in here are in half ranges about the centre of the environment's range, within [-1, 1], so
+that an agent learns the same in whatever unit the environment takes its actions; `Bounds` converts
+at the border. Shapes: ``B`` batch, ``A`` action elements.
 """
 
 import dataclasses
@@ -11,6 +13,7 @@ import optax
 from flax import struct
 from jax import lax
 
+from rtd3jax.agents.lstm import Carry
 from rtd3jax.agents.networks import (
     Params,
     apply_network,
@@ -53,24 +56,27 @@ class Hyperparameters:
 
 @struct.dataclass
 class Bounds:
-    """The action's range. ``low`` and ``high``: [A]."""
+    """The range of the environment's action, in its own units. ``low`` and ``high``: [A]."""
 
     low: jax.Array
     high: jax.Array
 
     @property
     def half_range(self) -> jax.Array:
-        """Half the distance between the bounds: [A]; the unit of the noise scales."""
-        return 0.5 * (self.high - self.low)
+        """Half the distance between the bounds: [A]; the unit in which agents act."""
+        return 0.5 * self.high - 0.5 * self.low
 
     @property
     def centre(self) -> jax.Array:
         """The middle of the range: [A]."""
-        return 0.5 * (self.high + self.low)
+        return 0.5 * self.high + 0.5 * self.low
 
-    def clip(self, action: jax.Array) -> jax.Array:
-        """``action`` [B, A] within the bounds."""
-        return jnp.clip(action, self.low[None, :], self.high[None, :])
+    def to_environment(self, action: jax.Array) -> jax.Array:
+        """An agent's ``action`` [A], in half ranges about the centre, in the environment's units.
+
+        It is within the bounds, also where the sum is rounded.
+        """
+        return jnp.clip(self.centre + self.half_range * action, self.low, self.high)
 
 
 @struct.dataclass
@@ -110,16 +116,15 @@ def init_learner(
     )
 
 
-def act(params: Params, variant: Variant, window: Window, bounds: Bounds, carry=None) -> jax.Array:
-    """The deterministic action [B, A] of an actor: tanh, scaled to the bounds."""
-    output = apply_network(params, variant.actor, window, carry=carry)
-    return bounds.centre[None, :] + bounds.half_range[None, :] * jnp.tanh(output)
+def act(params: Params, variant: Variant, window: Window, carry: Carry | None = None) -> jax.Array:
+    """The deterministic action [B, A] of an actor: tanh of the network's output."""
+    return jnp.tanh(apply_network(params, variant.actor, window, carry=carry))
 
 
-def explore(key: jax.Array, action: jax.Array, noise: jax.Array, bounds: Bounds) -> jax.Array:
-    """``action`` [B, A] with Gaussian noise, ``noise`` half ranges wide, within the bounds."""
+def add_noise(key: jax.Array, action: jax.Array, scale: jax.Array) -> jax.Array:
+    """``action`` [B, A] with Gaussian noise of standard deviation ``scale`` [], within [-1, 1]."""
     gaussian = jax.random.normal(key, action.shape, jnp.float32)
-    return bounds.clip(action + noise * bounds.half_range[None, :] * gaussian)
+    return jnp.clip(action + scale * gaussian, -1.0, 1.0)
 
 
 def target(
@@ -128,17 +133,15 @@ def target(
     batch: Batch,
     key: jax.Array,
     hyperparameters: Hyperparameters,
-    bounds: Bounds,
 ) -> jax.Array:
     """``y = r + gamma (1 - terminated) min_i Q'_i(next, smoothed target action)``: [B].
 
     ``r`` is the reward times ``reward_scale``.
     """
-    action = act(learner.target_actor, variant, batch.next_window, bounds)
+    action = act(learner.target_actor, variant, batch.next_window)
     noise = hyperparameters.target_noise * jax.random.normal(key, action.shape, jnp.float32)
     clip = hyperparameters.target_noise_clip
-    noise = jnp.clip(noise, -clip, clip) * bounds.half_range[None, :]
-    action = bounds.clip(action + noise)
+    action = jnp.clip(action + jnp.clip(noise, -clip, clip), -1.0, 1.0)
     first, second = (
         _value(critic, variant, batch.next_window, action, batch.next_carry)
         for critic in learner.target_critics
@@ -160,7 +163,6 @@ def actor_loss(
     batch: Batch,
     key: jax.Array,
     noise: jax.Array,
-    bounds: Bounds,
 ) -> jax.Array:
     """Minus the first critic's mean value of the actor's actions, averaged over noise on them.
 
@@ -168,7 +170,7 @@ def actor_loss(
     draw for each of the batch: a critic knows the value around where exploration went, while its
     slope at a single action is mostly kinks. With 0 it is TD3's loss.
     """
-    action = explore(key, act(actor, variant, batch.window, bounds), noise, bounds)
+    action = add_noise(key, act(actor, variant, batch.window), noise)
     carry = batch.carry
     if carry is None and variant.critic.memory:
         # No past token depends on the actor: the critic's prefix needs no tape.
@@ -182,10 +184,9 @@ def update_critics(
     batch: Batch,
     key: jax.Array,
     hyperparameters: Hyperparameters,
-    bounds: Bounds,
 ) -> tuple[Learner, jax.Array]:
     """One Adam step of both critics; the learner and the loss []."""
-    y = target(learner, variant, batch, key, hyperparameters, bounds)
+    y = target(learner, variant, batch, key, hyperparameters)
     pair = jax.tree.map(lambda *leaves: jnp.stack(leaves), *learner.critics)
     # One after the other, so that one tape is alive at a time: two do not fit in a CPU's cache.
     losses, gradients = lax.map(
@@ -205,7 +206,6 @@ def update_actor_and_targets(
     batch: Batch,
     key: jax.Array,
     hyperparameters: Hyperparameters,
-    bounds: Bounds,
 ) -> Learner:
     """One Adam step of the actor, then Polyak averaging of all targets."""
     gradient = jax.grad(actor_loss)(
@@ -215,7 +215,6 @@ def update_actor_and_targets(
         batch,
         key,
         hyperparameters.actor_noise,
-        bounds,
     )
     actor, optimizer = _descend(
         learner.actor, gradient, learner.actor_optimizer, hyperparameters.actor_learning_rate

@@ -9,6 +9,9 @@ Rows that would have begun before the episode begin at its first token instead, 
 what does not exist leaves no trace. So **a state of zeros is the start of an episode**, and neither
 a counter nor a mask is needed. No row is ever older than the window.
 
+Tokens hold actions in half ranges about the centre of the environment's range: the tanh of the
+output. Only the action that leaves is in the environment's units.
+
 Shapes: ``B`` batch, ``l`` history length, ``H`` width, ``O`` and ``A`` sizes of an observation and
 a flat action, ``D`` of a token.
 """
@@ -83,13 +86,14 @@ class Model:
         }
 
 
-def fold(actor: Mapping[str, Any], low: Any, high: Any) -> dict[str, np.ndarray]:
+def fold(actor: Mapping[str, Any], low: Any, high: Any, centre_token: Any) -> dict[str, np.ndarray]:
     """An actor's parameters as float32 arrays: biases merged, gates in the order of `GATES`.
 
     Args:
         actor: nested parameters of a trained actor.
         low: [A], the action's lower bound.
         high: [A], its upper bound.
+        centre_token: [A], what tokens hold for an action at the centre; left out where it is zero.
     """
     arrays = {}
     for layer in ("encoder", "current", "head", "output"):
@@ -104,6 +108,8 @@ def fold(actor: Mapping[str, Any], low: Any, high: Any) -> dict[str, np.ndarray]
     low, high = np.asarray(low, np.float32), np.asarray(high, np.float32)
     arrays["action_centre"] = np.float32(0.5) * (high + low)
     arrays["action_half_range"] = np.float32(0.5) * (high - low)
+    if np.any(centre_token):
+        arrays["centre_token"] = centre_token
     return {name: np.array(value, np.float32, order="C") for name, value in arrays.items()}
 
 

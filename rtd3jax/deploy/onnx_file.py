@@ -106,21 +106,23 @@ def _build(graph: _Graph, model: Model) -> None:
     if model.current:
         features.append(graph.add("Relu", [graph.linear("current", graph.join(model.current))]))
     head = graph.add("Relu", [graph.linear("head", graph.join(features))])
-    output = graph.add("Tanh", [graph.linear("output", head)])
-    scaled = graph.add("Mul", [output, graph.weight("action_half_range")])
-    flat = graph.add("Add", [scaled, graph.weight("action_centre")], "flat_action")
+    token = graph.add("Tanh", [graph.linear("output", head)], "action_token")
+    scaled = graph.add("Mul", [token, graph.weight("action_half_range")])
+    flat = graph.add("Add", [scaled, graph.weight("action_centre")])
     graph.add("Reshape", [flat, graph.integers(-1, *model.action_shape)], "action")
+    if "centre_token" in model.arrays:
+        token = graph.add("Add", [token, graph.weight("centre_token")], "shifted_action_token")
     if model.memory and not model.memory_has_current:
-        hidden, cell = _feed(graph, model, hidden, cell)
-    following = {"hidden": hidden, "cell": cell, "previous_action": flat}
+        hidden, cell = _feed(graph, model, hidden, cell, token)
+    following = {"hidden": hidden, "cell": cell, "previous_action": token}
     for name in model.state_shapes:
         graph.add("Identity", [following[name]], f"next_{name}")
 
 
-def _feed(graph: _Graph, model: Model, hidden: str, cell: str) -> tuple[str, str]:
-    """The carries [B, rows, H] after the step's token."""
+def _feed(graph: _Graph, model: Model, hidden: str, cell: str, action: str = "") -> tuple[str, str]:
+    """The carries [B, rows, H] after the step's token; ``action`` where a token has it."""
     width = model.width
-    parts = ["flat_action" if part == "action" else part for part in model.memory]
+    parts = [action if part == "action" else part for part in model.memory]
     token = graph.add("Relu", [graph.linear("encoder", graph.join(parts))])
     token = graph.add("Unsqueeze", [graph.linear("input", token), graph.integers(1)])
     recurrent = graph.add("MatMul", [hidden, graph.weight("recurrent_kernel")])

@@ -37,6 +37,7 @@ class Player:
             if f"{name}_kernel" in arrays
         }
         self._centre, self._half_range = arrays["action_centre"], arrays["action_half_range"]
+        self._centre_token = arrays.get("centre_token")
         self._length: int = about["history_length"]
         self._with_current: bool = about["memory_has_current"]
         if about["memory"]:
@@ -81,11 +82,14 @@ class Player:
             features.append(self._relu("current", _join(parts, self.about["current"])))
         head = self._relu("head", features[0] if len(features) == 1 else np.concatenate(features))
         kernel, bias = self._linear["output"]
-        action = self._centre + self._half_range * np.tanh(head @ kernel + bias)
+        token = np.tanh(head @ kernel + bias)
+        action = self._centre + self._half_range * token
+        if self._centre_token is not None:
+            token = token + self._centre_token
         if self.about["memory"] and not self._with_current:
-            self._feed({**parts, "action": action})
-        self._previous_action = action
-        return action.reshape(self.action_shape).copy()
+            self._feed({**parts, "action": token})
+        self._previous_action = token
+        return action.reshape(self.action_shape)
 
     def _feed(self, parts: dict[str, np.ndarray]) -> np.ndarray:
         """Give all carries the step's token; the hidden state of the one that began first."""

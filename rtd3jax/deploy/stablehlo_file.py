@@ -86,11 +86,14 @@ def play(
         features.append(jax.nn.relu(linear("current", current)))
     head = jax.nn.relu(linear("head", jnp.concatenate(features, axis=-1)))
     centre, half_range = arrays["action_centre"], arrays["action_half_range"]
-    action = centre[None, :] + half_range[None, :] * jnp.tanh(linear("output", head))
-    parts["action"] = action
+    token = jnp.tanh(linear("output", head))
+    action = centre[None, :] + half_range[None, :] * token
+    if "centre_token" in arrays:
+        token = token + arrays["centre_token"][None, :]
+    parts["action"] = token
     if model.memory and not model.memory_has_current:
         hidden, cell = feed(hidden, cell)
-    following = {"previous_action": action}
+    following = {"previous_action": token}
     if model.memory:
         following |= {"hidden": hidden, "cell": cell}
     action = action.reshape(-1, *model.action_shape)

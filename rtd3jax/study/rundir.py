@@ -19,7 +19,7 @@ import numpy as np
 from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
 from rtd3jax.files import flatten, read_arrays, write_arrays, write_bytes_atomically
-from rtd3jax.policy import Policy
+from rtd3jax.policy import FORMAT, Policy
 from rtd3jax.saved import restore_policy
 from rtd3jax.study.ceilings import ceilings_of
 from rtd3jax.study.figures import final_returns, learning_curves
@@ -101,12 +101,13 @@ class RunDirectory:
             self.path.mkdir(parents=True, exist_ok=True)
             if config.exists():
                 self._check_same(config)
+                self._check_format(config)
                 return
             if not all(map(_is_own, self.path.iterdir())):
                 raise UserError(
                     f"--out {self.path} is not empty and holds no study; choose another directory"
                 )
-            content = {"study": self._study, "made_with": _made_with()}
+            content = {"format": FORMAT, "study": self._study, "made_with": _made_with()}
             write_bytes_atomically(config, (json.dumps(content, indent=1) + "\n").encode())
         except OSError as error:
             raise UserError(f"--out {self.path} cannot be written: {error.strerror}") from error
@@ -118,6 +119,20 @@ class RunDirectory:
                 f"--out {self.path} holds another study ({_difference(study, self._study)}); "
                 "choose another directory, or remove that one"
             )
+
+    def _check_format(self, config: Path) -> None:
+        """Do not train further lanes beside those whose agents read actions in other units."""
+        if json.loads(config.read_text()).get("format", 1) == FORMAT or self.has_ended():
+            return
+        for cell in self.cells:
+            env = cell.make_env()
+            interface = describe(env, env.default_params)
+            if np.any(interface.action_low != -1.0) or np.any(interface.action_high != 1.0):
+                raise UserError(
+                    f"--out {self.path} was begun by rtd3jax 0.1, whose agents read the actions of "
+                    f"{cell.env} in the environment's units; agents now read half ranges, and the "
+                    "two do not belong in one table: choose another directory"
+                )
 
     def lane_path(self, cell: Cell, seed: int) -> Path:
         """Where a lane's file is."""
@@ -174,7 +189,7 @@ class RunDirectory:
         """
         arrays = {f"actor.{name}": value for name, value in flatten(actor).items()}
         arrays |= {f"results.{name}": np.asarray(value) for name, value in curves.items()}
-        about = {"cell": cell.to_dict(), "seed": seed, "failure": failure}
+        about = {"format": FORMAT, "cell": cell.to_dict(), "seed": seed, "failure": failure}
         write_arrays(self.lane_path(cell, seed), arrays, about)
 
     def policy(self, cell: Cell, seed: int) -> Policy:
@@ -200,6 +215,7 @@ class RunDirectory:
             algorithm=cell.config.algorithm,
             history_length=cell.config.history_length or 0,
             width=cell.config.hidden_size,
+            format=about.get("format", 1),
         )
 
     def write_error(self, cell: Cell, seed: int, reason: str) -> None:

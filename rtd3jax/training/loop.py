@@ -5,6 +5,7 @@ sampled from the step after it, when the behaviour actor has computed the carry 
 """
 
 import dataclasses
+import math
 from typing import Any
 
 import jax
@@ -27,7 +28,7 @@ from rtd3jax.agents.td3 import (
     Hyperparameters,
     Learner,
     act,
-    explore,
+    add_noise,
     init_learner,
     update_actor_and_targets,
     update_critics,
@@ -69,7 +70,7 @@ class LaneState:
         replay: what was seen.
         env_state: the environment's own.
         observation: [O], the one to act upon.
-        previous_action: [A], zero at an episode's start.
+        previous_action: [A], in half ranges as all actions of an agent; zero at an episode's start.
         age: int32 [], steps done in the episode.
         returns: [K], mean return of each evaluation so far.
         true_returns: [K], the same of the undisturbed state's reward.
@@ -162,6 +163,7 @@ class Program:
             actor=actor,
             bounds=self.bounds(lane),
             history_length=lane.hyperparameters.history_length,
+            centre_token=jnp.zeros((math.prod(self.action_shape),), jnp.float32),
             algorithm=self.config.algorithm,
             tokens=self.tokens,
             observation_size=self.observation_size,
@@ -169,12 +171,11 @@ class Program:
         )
 
     def bounds(self, lane: Lane) -> Bounds:
-        """The action's range under the lane's environment parameters."""
+        """The range of the environment's action under the lane's environment parameters."""
         return Bounds(*action_bounds(self.env, lane.env_params))
 
     def _step(self, lane: Lane, state: LaneState, step: jax.Array) -> LaneState:
         variant, numbers = VARIANTS[self.config.algorithm], lane.hyperparameters
-        bounds = self.bounds(lane)
         root = jax.random.key(lane.seed)
         act_key, learn_key, env_key = jax.random.split(
             jax.random.fold_in(jax.random.fold_in(root, _STEPS), step), 3
@@ -186,19 +187,20 @@ class Program:
         if variant.stores_carry:
             carry = carry_before(state.learner.actor, variant.actor, window)
             replay = _keep_carry(replay, step, carry, state.age)
-        action = self._act(state.learner, window, carry, act_key, numbers, bounds, step)
+        action = self._act(state.learner, window, carry, act_key, numbers, step)
 
-        learner, loss = self._learn(state.learner, replay, learn_key, numbers, bounds, step)
+        learner, loss = self._learn(state.learner, replay, learn_key, numbers, step)
 
+        command = self.bounds(lane).to_environment(action).reshape(self.action_shape)
         with foreign_code():
             observation, env_state, reward, terminated, truncated, info = self.env.step(
-                env_key, state.env_state, action.reshape(self.action_shape), lane.env_params
+                env_key, state.env_state, command, lane.env_params
             )
         final_observation = info["final_observation"].astype(jnp.float32)
         reward = reward.astype(jnp.float32)
         done = terminated.astype(bool) | truncated.astype(bool)
-        # Losses are not negative, and actions not above their bound.
-        never = (loss < 0.0) & jnp.all(action > bounds.high)
+        # Losses are not negative, and actions not above one.
+        never = (loss < 0.0) & jnp.all(action > 1.0)
         replay = put_transition(
             replay,
             _after(step, never),
@@ -239,16 +241,15 @@ class Program:
             previous_action=state.previous_action[None],
         )
 
-    def _act(self, learner, window, carry, key, numbers, bounds, step) -> jax.Array:
+    def _act(self, learner, window, carry, key, numbers, step) -> jax.Array:
         """Uniform before learning starts, then the actor's action with noise: [A]."""
         uniform_key, noise_key = jax.random.split(key)
-        shape = bounds.low.shape
-        uniform = jax.random.uniform(uniform_key, shape, jnp.float32, bounds.low, bounds.high)
-        greedy = act(learner.actor, VARIANTS[self.config.algorithm], window, bounds, carry)
-        noisy = explore(noise_key, greedy, numbers.exploration_noise, bounds)[0]
+        greedy = act(learner.actor, VARIANTS[self.config.algorithm], window, carry)
+        noisy = add_noise(noise_key, greedy, numbers.exploration_noise)[0]
+        uniform = jax.random.uniform(uniform_key, noisy.shape, jnp.float32, -1.0, 1.0)
         return jnp.where(step < self.config.learning_starts, uniform, noisy)
 
-    def _learn(self, learner, replay, key, numbers, bounds, step) -> tuple[Learner, jax.Array]:
+    def _learn(self, learner, replay, key, numbers, step) -> tuple[Learner, jax.Array]:
         """The step's updates, if it has any; the critics' loss."""
         config = self.config
         variant = VARIANTS[config.algorithm].at(config.precision)
@@ -262,12 +263,10 @@ class Program:
             batch = sample(
                 replay, sample_key, step, config.batch_size, self.tokens, numbers.history_length
             )
-            learner, loss = update_critics(learner, variant, batch, target_key, numbers, bounds)
+            learner, loss = update_critics(learner, variant, batch, target_key, numbers)
             learner = lax.cond(
                 updates % config.policy_delay == 0,
-                lambda before: update_actor_and_targets(
-                    before, variant, batch, actor_key, numbers, bounds
-                ),
+                lambda before: update_actor_and_targets(before, variant, batch, actor_key, numbers),
                 lambda before: before,
                 learner,
             )

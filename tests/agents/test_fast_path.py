@@ -12,7 +12,6 @@ from rtd3jax.agents.variants import VARIANTS
 from rtd3jax.agents.windows import Steps, Window
 
 B, L, WIDTH, UPDATES = 8, 3, 8, 200
-BOUNDS = td3.Bounds(jnp.array([-2.0]), jnp.array([2.0]))
 NUMBERS = td3.Hyperparameters(
     *(jnp.float32(x) for x in (1e-3, 1e-3, 1.0, 0.9, 1.0, 0.005, 0.1, 0.2, 0.5, 0.0)),
     history_length=jnp.int32(L),
@@ -31,7 +30,7 @@ def _batch(key):
     length = jax.random.randint(a, (B,), 0, L + 1)
     return Batch(
         window=_window(b, length),
-        action=jax.random.uniform(c, (B, 1), minval=-2.0, maxval=2.0),
+        action=jax.random.uniform(c, (B, 1), minval=-1.0, maxval=1.0),
         reward=jax.random.normal(d, (B,)),
         next_window=_window(e, jnp.minimum(length + 1, L)),
         terminated=jax.random.bernoulli(f, 0.1, (B,)),
@@ -42,14 +41,14 @@ def _batch(key):
 
 def _straightforward(learner, variant, batch, key):
     """One step of TD3 as one writes it down: joint losses, automatic differentiation, optax."""
-    y = td3.target(learner, variant, batch, key, NUMBERS, BOUNDS)
+    y = td3.target(learner, variant, batch, key, NUMBERS)
 
     def critics_loss(critics):
         values = [apply_network(c, variant.critic, batch.window, batch.action) for c in critics]
         return sum(jnp.mean((value[:, 0] - y) ** 2) for value in values)
 
     def actor_loss(actor):
-        action = td3.act(actor, variant, batch.window, BOUNDS)
+        action = td3.act(actor, variant, batch.window)
         return -jnp.mean(apply_network(critics[0], variant.critic, batch.window, action))
 
     adam = optax.scale_by_adam()
@@ -79,8 +78,8 @@ def _straightforward(learner, variant, batch, key):
 
 
 def _fast(learner, variant, batch, key):
-    learner, _ = td3.update_critics(learner, variant, batch, key, NUMBERS, BOUNDS)
-    return td3.update_actor_and_targets(learner, variant, batch, key, NUMBERS, BOUNDS)
+    learner, _ = td3.update_critics(learner, variant, batch, key, NUMBERS)
+    return td3.update_actor_and_targets(learner, variant, batch, key, NUMBERS)
 
 
 def _reference_lstm(params, inputs, exists, carry=None, precision="float32"):

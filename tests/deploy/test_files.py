@@ -100,7 +100,9 @@ def test_actions_have_the_shape_of_the_environments(tmp_path, policy, shape):
     kernel = actor["encoder"]["kernel"]
     actor["encoder"] = {**actor["encoder"], "kernel": kernel[: 2 + size]}
     bounds = jax.tree.map(lambda b: b[:size], policy.bounds)
-    shaped = policy.replace(actor=actor, bounds=bounds, action_shape=shape)
+    shaped = policy.replace(
+        actor=actor, bounds=bounds, centre_token=policy.centre_token[:size], action_shape=shape
+    )
     shaped.save(tmp_path / "p")
     expected, _ = rtd.load_policy(tmp_path / "p").step(shaped.init(), np.float32([1.0, 2.0]))
     assert expected.shape == shape

@@ -20,7 +20,6 @@ from experiments.benchmarks.torch_reference import Learner, tensors  # noqa: E40
 
 CAPACITY, STEPS, LENGTH, OBS, A, WIDTH = 30, 47, 2, 3, 2, 8
 NUMBERS = [40, 46, 17, 18, 19, 20, 30, 31, 45]  # oldest and newest rows, and episodes' starts
-BOUNDS = td3.Bounds(jnp.array([-2.0, -2.0]), jnp.array([4.0, 4.0]))
 HYPERPARAMETERS = dict(
     actor_learning_rate=1e-3,
     critic_learning_rate=1e-3,
@@ -178,9 +177,9 @@ def _update(variant, before, batch):
     numbers = td3.Hyperparameters(**numbers, history_length=jnp.int32(LENGTH))
     key = jax.random.key(5)
     gaussian = jax.random.normal(key, (len(NUMBERS), A), jnp.float32)
-    y = td3.target(before, variant, batch, key, numbers, BOUNDS)
-    after, loss = td3.update_critics(before, variant, batch, key, numbers, BOUNDS)
-    after = td3.update_actor_and_targets(after, variant, batch, key, numbers, BOUNDS)
+    y = td3.target(before, variant, batch, key, numbers)
+    after, loss = td3.update_critics(before, variant, batch, key, numbers)
+    after = td3.update_actor_and_targets(after, variant, batch, key, numbers)
     return y, loss, after, gaussian
 
 
@@ -199,8 +198,6 @@ def test_an_update_is_the_same(batches, name):
         OBS,
         A,
         WIDTH,
-        low=-2.0,
-        high=4.0,
         gamma=0.9,
         tau=0.1,
         learning_rate=1e-3,

@@ -32,7 +32,6 @@ def _mapped(f, xs):
 def _counted(algorithm, length, width, batch_size):
     """XLA's count for a step's updates: products of any size, and elementwise operations."""
     variant = VARIANTS[algorithm]
-    bounds = td3.Bounds(-jnp.ones(2), jnp.ones(2))
     numbers = {f.name: jnp.float32(0.1) for f in dataclasses.fields(td3.Hyperparameters)}
     numbers = td3.Hyperparameters(**numbers | {"history_length": jnp.int32(length)})
 
@@ -46,11 +45,11 @@ def _counted(algorithm, length, width, batch_size):
 
     def critics(learner, batch):
         key = jax.random.key(0)
-        return td3.update_critics(learner, variant, batch, key, numbers, bounds)
+        return td3.update_critics(learner, variant, batch, key, numbers)
 
     def actor(learner, batch):
         key = jax.random.key(0)
-        return td3.update_actor_and_targets(learner, variant, batch, key, numbers, bounds)
+        return td3.update_actor_and_targets(learner, variant, batch, key, numbers)
 
     count = [
         jax.jit(update).lower(*jax.eval_shape(inputs)).cost_analysis()["flops"]

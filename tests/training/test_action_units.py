@@ -1,0 +1,85 @@
+"""An agent learns the same whatever the unit and the centre of the environment's actions."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+from gymnax.environments import environment, spaces
+
+import rtd3jax as rtd
+
+
+class Params(struct.PyTreeNode):
+    max_steps_in_episode: int = 20
+
+
+class State(struct.PyTreeNode):
+    time: jax.Array
+    x: jax.Array
+
+
+class Follow(environment.Environment):
+    """Reward: minus the squared distance of each action, in half ranges, from what is seen."""
+
+    def __init__(self, centre, half_range):
+        super().__init__()
+        self.centre, self.half_range = (np.asarray(x, np.float32) for x in (centre, half_range))
+
+    @property
+    def default_params(self):
+        return Params()
+
+    def reset_env(self, key, params):
+        x = jax.random.uniform(key, (3,), jnp.float32, -1, 1)
+        return x, State(jnp.int32(0), x)
+
+    def step_env(self, key, state, action, params):
+        action = (action - self.centre) / self.half_range
+        reward = -jnp.sum(jnp.square(action - state.x[:2]))
+        new = State(state.time + 1, 0.9 * state.x)
+        return new.x, new, reward, jnp.asarray(False), {}
+
+    def action_space(self, params=None):
+        return spaces.Box(self.centre - self.half_range, self.centre + self.half_range, (2,))
+
+
+def _trained(centre, half_range, algorithm):
+    env = Follow(centre, half_range)
+    config = rtd.Config(
+        algorithm=algorithm,
+        history_length=None if algorithm == "td3" else 2,
+        total_steps=600,
+        hidden_size=16,
+        batch_size=32,
+        learning_starts=100,
+        eval_every=200,
+        eval_episodes=5,
+    )
+    return env, rtd.train(env, config, seeds=[0], progress=False)
+
+
+@pytest.mark.parametrize("algorithm", ["td3", "lstm-td3", "h-td3"])
+def test_the_unit_of_the_actions_does_not_matter(algorithm):
+    _, run = _trained([0, 0], [1, 1], algorithm)
+    # Powers of two are exact: the same to the bit, also where elements differ by 2**20.
+    for half_range in ([2.0**-10, 2.0**10], [2.0**20, 1.0]):
+        _, other = _trained([0, 0], half_range, algorithm)
+        np.testing.assert_array_equal(other.returns, run.returns)
+        leaves = (jax.tree.leaves(r.policy(0).actor) for r in (run, other))
+        for one, two in zip(*leaves, strict=True):
+            np.testing.assert_array_equal(one, two)
+
+
+def test_neither_does_the_centre():
+    _, run = _trained([0, 0], [1, 1], "lstm-td3-1ha1hc")
+    env, other = _trained([100, 0.3], [1, 0.3], "lstm-td3-1ha1hc")
+    assert run.returns[0, -1] > 0.5 * run.returns[0, 0]  # it learns
+    np.testing.assert_allclose(other.returns, run.returns, rtol=1e-2)
+    policy, expected = other.policy(0), run.policy(0)
+    state, expected_state = policy.init(), expected.init()
+    for observation in np.random.default_rng(0).uniform(-1, 1, (5, 3)).astype(np.float32):
+        action, state = policy.step(state, observation)
+        want, expected_state = expected.step(expected_state, observation)
+        half_ranges = (np.asarray(action) - env.centre) / env.half_range
+        np.testing.assert_allclose(half_ranges, want, atol=2e-2)
