@@ -29,7 +29,7 @@ import rtd3jax as rtd
 from rtd3jax.envs.registry import parse_disturbance
 from rtd3jax.errors import UserError
 from rtd3jax.study import presets
-from rtd3jax.study.figures import COLOURS
+from rtd3jax.study.colours import colour_of
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.transfer import transfer
 
@@ -195,8 +195,10 @@ def draw(lanes: pd.DataFrame, path: pathlib.Path) -> None:
             for k, length in enumerate(lengths):
                 values = own[own["history_length"] == length]["normalised"]
                 x = index + 0.7 * ((k + 0.5) / len(lengths) - 0.5)
-                axes.plot([x] * len(values), values, ".", ms=4, color=COLOURS[algorithm], alpha=0.5)
-                axes.plot(x, values.mean(), "_", ms=9, mew=2, color=COLOURS[algorithm])
+                axes.plot(
+                    [x] * len(values), values, ".", ms=4, color=colour_of(algorithm), alpha=0.5
+                )
+                axes.plot(x, values.mean(), "_", ms=9, mew=2, color=colour_of(algorithm))
         axes.axhline(1.0, color="#777777", lw=0.8)
         axes.set_xticks(range(len(agents)), agents, rotation=60, ha="right")
         axes.set_xlim(-0.6, len(agents) - 0.4)

@@ -18,7 +18,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import rtd3jax as rtd
-from rtd3jax.study.figures import COLOURS
+from rtd3jax.study.colours import colour_of
 from rtd3jax.study.report.playback import record_episodes
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
@@ -45,9 +45,9 @@ def animate(plays: dict[str, dict[str, np.ndarray]], path: pathlib.Path, every: 
         values = np.concatenate([play[kind][:, 2] for kind in ("true", "seen")])
         bottom.set_ylim(values.min() - 0.5, values.max() + 0.5)
         (seen_rod,) = top.plot([], [], color=SEEN, lw=2, ls=":", marker="o", label="reported")
-        (rod,) = top.plot([], [], color=COLOURS[name], lw=5, label="true")
+        (rod,) = top.plot([], [], color=colour_of(name), lw=5, label="true")
         (seen_line,) = bottom.plot([], [], color=SEEN, lw=1)
-        (line,) = bottom.plot([], [], color=COLOURS[name], lw=1.5)
+        (line,) = bottom.plot([], [], color=colour_of(name), lw=1.5)
         moving.append((top, name, play, rod, seen_rod, line, seen_line))
         if column == 0:
             bottom.set_ylabel("angular velocity\nrad/s")

@@ -1,8 +1,12 @@
 """Recurrent TD3 agents for plants whose disturbance is hidden and evolves."""
 
-from rtd3jax.agents.networks import count_parameters
+from rtd3jax.agents.agent import Agent, count_parameters, make_agent
+from rtd3jax.agents.learners import register_learner
+from rtd3jax.agents.memory import Memory, register_memory
+from rtd3jax.agents.networks import NetworkSpec
+from rtd3jax.agents.variants import ALGORITHMS, Variant, register_agent
 from rtd3jax.ceilings import Ceiling, bayes_policy, ceiling
-from rtd3jax.config import ALGORITHMS, Config
+from rtd3jax.config import Config
 from rtd3jax.deploy.stablehlo_file import load_stablehlo
 from rtd3jax.envs.brax_env import from_brax
 from rtd3jax.envs.check import Finding, check_env, find_problems
@@ -23,6 +27,7 @@ __all__ = [
     "ALGORITHMS",
     "DISTURBANCES",
     "ENVIRONMENTS",
+    "Agent",
     "Ceiling",
     "Chain",
     "Config",
@@ -34,6 +39,8 @@ __all__ = [
     "GainDrift",
     "GaussianNoise",
     "Hidden",
+    "Memory",
+    "NetworkSpec",
     "Nothing",
     "OrnsteinUhlenbeck",
     "Policy",
@@ -44,6 +51,7 @@ __all__ = [
     "Sine",
     "Sum",
     "UserError",
+    "Variant",
     "bayes_policy",
     "ceiling",
     "check_env",
@@ -56,8 +64,12 @@ __all__ = [
     "find_problems",
     "from_brax",
     "make",
+    "make_agent",
     "random_policy",
     "register",
+    "register_agent",
+    "register_learner",
+    "register_memory",
     "run_in_gymnasium",
     "to_gymnasium",
     "train",

@@ -11,16 +11,7 @@ import warnings
 from typing import Any
 
 from rtd3jax.errors import UserError, nearest
-
-ALGORITHMS = (
-    "td3",
-    "lstm-td3",
-    "lstm-td3-no-action",
-    "lstm-td3-1ha1hc",
-    "lstm-td3-1ha2hc",
-    "h-td3",
-)
-"""The six agents of the paper; ``rtd3jax.agents.variants`` says what each reads."""
+from rtd3jax.registries import AGENTS, MEMORIES
 
 PRECISIONS = ("float32", "bfloat16")
 
@@ -47,10 +38,13 @@ class Config:
 
     algorithm: str = dataclasses.field(
         default="lstm-td3-1ha1hc",
-        metadata={"help": "the agent: " + ", ".join(ALGORITHMS), "traced": False},
+        metadata={"help": "the agent; rtd3jax.agents.variants says what each reads"},
     )
     history_length: int | None = _field(
-        None, "past steps in a window, l in the paper (td3 has none: 0) [10]", low=1
+        None,
+        "past steps in a window, l in the paper; 0 for agents without one "
+        f"[{DEFAULT_HISTORY_LENGTH}]",
+        low=1,
     )
     total_steps: int = _field(30_000, "environment steps of a lane", low=1)
     hidden_size: int = _field(128, "width H of every layer (the paper's Table: 128)", low=1)
@@ -102,22 +96,22 @@ class Config:
     replay_capacity: int | None = _field(
         None, "transitions kept; the oldest leave first [total_steps]", low=1
     )
+    memory: str = dataclasses.field(
+        default="lstm",
+        metadata={"help": "the recurrent cell: lstm (the paper's), gru, min-gru, or your own"},
+    )
     precision: str = dataclasses.field(
         default="float32",
         metadata={
             "help": "of the factors of wide products in updates: float32, bfloat16",
-            "traced": False,
         },
     )
     eval_every: int = _field(1_000, "environment steps between evaluations", low=1)
     eval_episodes: int = _field(10, "episodes of an evaluation", low=1)
 
     def __post_init__(self) -> None:
-        if self.algorithm not in ALGORITHMS:
-            raise UserError(
-                f"algorithm {self.algorithm!r} is unknown{nearest(str(self.algorithm), ALGORITHMS)}"
-                f"; the algorithms are {', '.join(ALGORITHMS)}"
-            )
+        AGENTS.check(self.algorithm)
+        MEMORIES.check(self.memory)
         if self.precision not in PRECISIONS:
             raise UserError(
                 f"precision {self.precision!r} is unknown{nearest(str(self.precision), PRECISIONS)}"
@@ -135,7 +129,7 @@ class Config:
                 f"({self.learning_starts}): the first update would have too few transitions; "
                 "raise learning_starts or lower batch_size"
             )
-        window = 1 + (self.history_length or 0)
+        window = 1 + self.tokens
         if capacity < max(self.batch_size, window):
             raise UserError(
                 f"replay_capacity ({capacity}) holds less than a batch "
@@ -143,10 +137,11 @@ class Config:
             )
 
     def _resolve_history_length(self) -> None:
-        if self.algorithm == "td3":
+        if not self.has_window:
             if self.history_length not in (None, 0):
                 warnings.warn(
-                    f"history_length={self.history_length} has no effect: td3 has no window",
+                    f"history_length={self.history_length} has no effect: {self.algorithm} has "
+                    "no window",
                     stacklevel=4,
                 )
             object.__setattr__(self, "history_length", 0)
@@ -163,7 +158,7 @@ class Config:
         if number is None:
             raise UserError(f"{field.name} must be {kind}, not {value!r}")
         low, high = field.metadata["low"], field.metadata["high"]
-        if field.name == "history_length" and self.algorithm == "td3":
+        if field.name == "history_length" and not self.has_window:
             low = 0
         if not low <= number <= high:
             bounds = f"at least {low}" if high == math.inf else f"between {low} and {high}"
@@ -172,6 +167,23 @@ class Config:
             raise UserError(f"{field.name} must be below 2**31, not {value!r}")
         return number
 
+    @property
+    def has_window(self) -> bool:
+        """Whether the agent reads past steps."""
+        return AGENTS[self.algorithm].has_window
+
+    @property
+    def tokens(self) -> int:
+        """Past tokens in a window: l, and 0 for an agent without one."""
+        assert self.history_length is not None  # resolved when it was made
+        return self.history_length
+
+    @property
+    def capacity(self) -> int:
+        """Transitions that the replay keeps."""
+        assert self.replay_capacity is not None  # resolved when it was made
+        return self.replay_capacity
+
     def to_dict(self) -> dict[str, Any]:
         """The fields as JSON-ready values."""
         return dataclasses.asdict(self)
@@ -179,7 +191,7 @@ class Config:
 
 def traced_fields() -> tuple[str, ...]:
     """Names of the fields in which lanes of one program may differ."""
-    return tuple(f.name for f in dataclasses.fields(Config) if f.metadata["traced"])
+    return tuple(f.name for f in dataclasses.fields(Config) if f.metadata.get("traced"))
 
 
 def _as_number(value: Any, integral: bool) -> int | float | None:

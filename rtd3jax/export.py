@@ -5,11 +5,11 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from rtd3jax.config import ALGORITHMS
 from rtd3jax.deploy.formats import FORMATS
 from rtd3jax.errors import UserError
 from rtd3jax.load import load_policy
 from rtd3jax.policy import Policy
+from rtd3jax.registries import AGENTS
 
 POLICY = "policy"
 """The form that `rtd3jax.load_policy` reads."""
@@ -65,7 +65,7 @@ def _parser() -> argparse.ArgumentParser:
         "--format", required=True, choices=(*FORMATS, POLICY), help="the form of the file"
     )
     which = parser.add_argument_group("which lane of the run directory")
-    which.add_argument("--agent", choices=ALGORITHMS, help="the agent")
+    which.add_argument("--agent", help=f"the agent: {', '.join(AGENTS)}, or your own")
     which.add_argument("--seed", type=int, help="the seed [0]")
     which.add_argument("--env", help="where its lanes differ: the environment")
     which.add_argument("--disturbance", help="the disturbance, as it was given to the sweep")

@@ -12,15 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from rtd3jax.agents.networks import Params
-from rtd3jax.agents.td3 import Bounds, act
-from rtd3jax.agents.variants import VARIANTS
-from rtd3jax.agents.windows import Steps, Window, empty_steps, past_tokens, put_step
+from rtd3jax.agents.agent import make_part
+from rtd3jax.agents.bounds import Bounds
+from rtd3jax.agents.history import Steps, empty_steps, put_step, window_at
+from rtd3jax.agents.memory.base import Params
+from rtd3jax.agents.networks import Network, act
 from rtd3jax.deploy.formats import writer_of
 from rtd3jax.deploy.model import Model, fold
 from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
 from rtd3jax.files import array_bytes, check_target, flatten, write_new
+from rtd3jax.registries import AGENTS
 from rtd3jax.versions import versions_of
 
 FORMAT = 2
@@ -60,6 +62,7 @@ class Policy:
         tokens: past tokens in the window's arrays, at least l.
         observation_size: O.
         action_shape: shape of the environment's action.
+        memory: the name of its recurrent cell.
     """
 
     actor: Params
@@ -70,6 +73,18 @@ class Policy:
     tokens: int = struct.field(pytree_node=False)
     observation_size: int = struct.field(pytree_node=False)
     action_shape: tuple[int, ...] = struct.field(pytree_node=False)
+    memory: str = struct.field(pytree_node=False, default="lstm")
+
+    @property
+    def width(self) -> int:
+        """H."""
+        return int(self.actor["head"]["bias"].shape[-1])
+
+    @property
+    def network(self) -> Network:
+        """The actor as a module."""
+        sizes = self.observation_size, int(np.prod(self.action_shape, dtype=int))
+        return make_part(AGENTS[self.algorithm], "actor", self.memory, *sizes, self.width)
 
     def init(self, key: jax.Array | None = None) -> PolicyState:
         """The state before an episode's first step; ``key`` is not needed."""
@@ -93,14 +108,17 @@ class Policy:
                 f"not {observation.shape}: it was trained on another environment"
             )
         time = state.time[None]
-        past, length = past_tokens(state.steps, time, time, state.time, self.tokens)
-        window = Window(
-            past=past,
-            length=jnp.minimum(length, self.history_length),
-            observation=observation[None],
-            previous_action=state.previous_action[None],
+        window = window_at(
+            state.steps,
+            time,
+            time,
+            state.time,
+            self.tokens,
+            self.history_length,
+            observation[None],
+            state.previous_action[None],
         )
-        action = act(self.actor, VARIANTS[self.algorithm], window)[0]
+        action = act(self.network, self.actor, window)[0]
         token = action + self.centre_token
         steps = put_step(state.steps, state.time, Steps(observation, state.previous_action, token))
         state = PolicyState(steps, token, state.time + jnp.int32(1))
@@ -130,7 +148,8 @@ class Policy:
         """
         content_of = writer_of(format, str(path))
         check_target(path, overwrite)
-        actor, reads = self._actor(), VARIANTS[self.algorithm].actor
+        actor, reads = self._actor(), AGENTS[self.algorithm].actor
+        cell = self.memory if reads.memory else None
         model = Model(
             memory=reads.memory,
             memory_has_current=reads.memory_has_current,
@@ -138,8 +157,11 @@ class Policy:
             history_length=int(self.history_length),
             observation_size=self.observation_size,
             action_shape=self.action_shape,
-            arrays=fold(actor, self.bounds.low, self.bounds.high, self.centre_token),
+            arrays=fold(actor, cell, self.bounds.low, self.bounds.high, self.centre_token),
             about=self._about(),
+            cell=cell,
+            network=self.network,
+            params=actor,
         )
         write_new(path, content_of(model), overwrite)
 
@@ -165,7 +187,8 @@ class Policy:
             "action_low": np.asarray(self.bounds.low).tolist(),
             "action_high": np.asarray(self.bounds.high).tolist(),
             "centre_token": np.asarray(self.centre_token).tolist(),
-            "hidden_size": int(self.actor["head"]["bias"].shape[-1]),
+            "hidden_size": self.width,
+            "memory": self.memory,
             "versions": versions_of(("rtd3jax", "jax", "jaxlib", "numpy")),
         }
 

@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,17 +11,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rtd3jax.agents.networks import Params, init_network, part_sizes
-from rtd3jax.agents.td3 import Bounds
-from rtd3jax.agents.variants import VARIANTS, NetworkSpec
-from rtd3jax.config import ALGORITHMS
+from rtd3jax.agents.agent import make_part
+from rtd3jax.agents.bounds import Bounds
+from rtd3jax.agents.memory.base import Params
+from rtd3jax.agents.networks import NetworkSpec, init_network, part_sizes
 from rtd3jax.envs.interface import Interface
 from rtd3jax.errors import UserError
 from rtd3jax.files import flatten, read_arrays, unflatten
 from rtd3jax.policy import FORMAT, KIND, Policy
+from rtd3jax.registries import AGENTS, MEMORIES
 
 _FORMATS = (1, FORMAT)
 _ACTIONS = ("action", "previous_action")
+_OLD_NAME = re.compile(r"^lstm\.")
+"""How the memory's arrays began when the LSTM was the only one."""
 
 
 def read_policy(path: str | os.PathLike) -> Policy:
@@ -56,6 +60,7 @@ def restore_policy(
     algorithm: str,
     history_length: int,
     width: int,
+    memory: str = "lstm",
     format: int = FORMAT,
     centre_token: np.ndarray | None = None,
 ) -> Policy:
@@ -68,17 +73,18 @@ def restore_policy(
         algorithm: the agent's id.
         history_length: l; 0 for td3.
         width: H.
+        memory: the name of its recurrent cell.
         format: of the file; an actor of format 1 is converted.
         centre_token: [A], as in the policy; zero by default.
 
     Raises:
         UserError: when an array is missing, too many, of another shape or type, or not finite.
     """
-    spec = VARIANTS[algorithm].actor
+    spec = AGENTS[algorithm].actor
     sizes = part_sizes(interface.observation_size, interface.action_size)
-    shapes = jax.eval_shape(
-        lambda: init_network(jax.random.key(0), spec, sizes, width, interface.action_size)
-    )
+    network = make_part(AGENTS[algorithm], "actor", memory, *interface.sizes, width)
+    shapes = jax.eval_shape(lambda: init_network(jax.random.key(0), network))
+    actor = {_OLD_NAME.sub("memory.", name): array for name, array in actor.items()}
     expected = flatten(
         jax.tree.map(lambda leaf: np.broadcast_to(np.float32(0), leaf.shape), shapes)
     )
@@ -114,6 +120,7 @@ def restore_policy(
         tokens=history_length,
         observation_size=interface.observation_size,
         action_shape=interface.action_shape,
+        memory=memory,
     )
 
 
@@ -137,10 +144,19 @@ def _in_half_ranges(
 def _header(path: str | os.PathLike, about: dict[str, Any]) -> tuple[Interface, dict[str, Any]]:
     """What a file's header says, checked: the interface, and `restore_policy`'s other facts."""
     wrong = f"{path} is damaged: its header's"
-    algorithm = about.get("algorithm")
-    if algorithm not in ALGORITHMS:
-        raise UserError(f"{wrong} algorithm is {algorithm!r}, not one of {', '.join(ALGORITHMS)}")
-    lowest = {"observation_size": 1, "hidden_size": 1, "history_length": algorithm != "td3"}
+    algorithm, memory = about.get("algorithm"), about.get("memory", "lstm")
+    if not isinstance(algorithm, str) or algorithm not in AGENTS:
+        raise UserError(
+            f"{path}: the agent {algorithm!r} is not known here, only {', '.join(AGENTS)}; "
+            "register yours with rtd.register_agent before you load it"
+        )
+    if memory not in MEMORIES:
+        raise UserError(
+            f"{path}: the memory {memory!r} is not known here, only {', '.join(MEMORIES)}; "
+            "register yours with rtd.register_memory before you load it"
+        )
+    windowed = AGENTS[algorithm].has_window
+    lowest = {"observation_size": 1, "hidden_size": 1, "history_length": windowed}
     for name, least in lowest.items():
         if not _is_count(about.get(name), int(least)):
             raise UserError(f"{wrong} {name} is {about.get(name)!r}")
@@ -163,6 +179,7 @@ def _header(path: str | os.PathLike, about: dict[str, Any]) -> tuple[Interface, 
         "format": about["format"],
         "centre_token": centre_token,
         "algorithm": algorithm,
+        "memory": memory,
         "history_length": about["history_length"],
         "width": about["hidden_size"],
     }

@@ -4,24 +4,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rtd3jax.agents.networks import init_network, part_sizes
-from rtd3jax.agents.td3 import Bounds
-from rtd3jax.agents.variants import VARIANTS
+from rtd3jax.agents.agent import make_part
+from rtd3jax.agents.bounds import Bounds
+from rtd3jax.agents.networks import init_network
 from rtd3jax.envs.interface import describe
 from rtd3jax.policy import Policy
+from rtd3jax.registries import AGENTS
 
 LENGTH = 3
 
 
-def random_policy(algorithm, env, *, width=8, length=LENGTH, seed=0, scale=3.0):
+def random_policy(algorithm, env, *, width=8, length=LENGTH, seed=0, scale=3.0, memory="lstm"):
     """An untrained policy whose weights before the output are ``scale`` times their usual size."""
     interface = describe(env, env.default_params)
     length = 0 if algorithm == "td3" else length
-    sizes = part_sizes(interface.observation_size, interface.action_size)
-    spec = VARIANTS[algorithm].actor
-    shapes = jax.eval_shape(
-        lambda: init_network(jax.random.key(0), spec, sizes, width, interface.action_size)
-    )
+    network = make_part(AGENTS[algorithm], "actor", memory, *interface.sizes, width)
+    shapes = jax.eval_shape(lambda: init_network(jax.random.key(0), network))
     chance = np.random.default_rng(seed)
 
     def weights(layer, leaf):
@@ -40,4 +38,5 @@ def random_policy(algorithm, env, *, width=8, length=LENGTH, seed=0, scale=3.0):
         tokens=length + 2 * bool(length),  # as where lanes of several lengths share a program
         observation_size=interface.observation_size,
         action_shape=interface.action_shape,
+        memory=memory,
     )

@@ -8,9 +8,11 @@ import pytest
 from flax import struct
 
 import rtd3jax as rtd
-from rtd3jax.agents.td3 import Bounds, init_learner
-from rtd3jax.agents.variants import VARIANTS
+from rtd3jax.agents.agent import make_part
+from rtd3jax.agents.bounds import Bounds
+from rtd3jax.agents.networks import init_network
 from rtd3jax.errors import UserError
+from rtd3jax.registries import AGENTS
 
 
 @struct.dataclass
@@ -63,7 +65,9 @@ def test_from_one_state_both_pendulums_go_the_same_way():
 
 def test_a_recurrent_policy_plays_with_its_window():
     policy = rtd.Policy(
-        actor=init_learner(jax.random.key(0), VARIANTS["lstm-td3-1ha1hc"], 3, 1, 8).actor,
+        actor=init_network(
+            jax.random.key(0), make_part(AGENTS["lstm-td3-1ha1hc"], "actor", "lstm", 3, 1, 8)
+        ),
         bounds=Bounds(jnp.array([-2.0]), jnp.array([2.0])),
         history_length=jnp.int32(2),
         centre_token=jnp.zeros(1),

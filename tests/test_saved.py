@@ -95,7 +95,10 @@ def test_a_batch_of_policies_is_refused(tmp_path, policy):
 @pytest.mark.parametrize(
     "change, message",
     [
-        (lambda a: {n: v for n, v in a.items() if n != "lstm.input_bias"}, "lacks .*lstm.input_b"),
+        (
+            lambda a: {n: v for n, v in a.items() if n != "memory.input_bias"},
+            "lacks .*memory.input_b",
+        ),
         (lambda a: a | {"more.kernel": np.zeros(1)}, "too many: more.kernel"),
         (lambda a: a | {"head.kernel": np.zeros((3, 8), np.float32)}, r"\[3, 8\], not \[16, 8\]"),
         (lambda a: a | {"head.bias": np.zeros(8)}, "float64, not float32"),
@@ -114,7 +117,8 @@ def test_arrays_that_do_not_fit_are_refused(tmp_path, policy, change, message):
         ({"format": 3}, "has format 3, .* reads up to 2"),
         ({"centre_token": [0.0]}, "centre_token is not 2 numbers"),
         ({"kind": "shopping list"}, "is not a saved policy"),
-        ({"algorithm": "ppo"}, "algorithm is 'ppo'"),
+        ({"algorithm": "ppo"}, "agent .ppo. is not known here"),
+        ({"memory": "hippocampus"}, "memory .hippocampus. is not known here.*rtd.register_memory"),
         ({"history_length": 0}, "history_length is 0"),
         ({"hidden_size": True}, "hidden_size is True"),
         ({"observation_size": "2"}, "observation_size is '2'"),

@@ -8,7 +8,8 @@ import pandas as pd
 import pytest
 
 from rtd3jax import sweep
-from rtd3jax.config import ALGORITHMS, Config
+from rtd3jax.agents.variants import ALGORITHMS
+from rtd3jax.config import Config
 from rtd3jax.envs import registry
 from rtd3jax.study import presets, recorder, references
 from rtd3jax.study.plan import Cell, Grid, make_cells

@@ -28,9 +28,10 @@ import numpy as np
 import onnxruntime
 
 import rtd3jax as rtd
-from rtd3jax.agents.networks import init_network, part_sizes
-from rtd3jax.agents.td3 import Bounds
-from rtd3jax.agents.variants import VARIANTS
+from rtd3jax.agents.agent import make_part
+from rtd3jax.agents.bounds import Bounds
+from rtd3jax.agents.networks import init_network
+from rtd3jax.registries import AGENTS
 
 RESULTS = pathlib.Path(__file__).parents[1] / "results" / "benchmarks"
 OBSERVATIONS, ACTIONS = 3, 1
@@ -39,8 +40,8 @@ STEPS = 200
 
 def policy_of(algorithm, length, width):
     length = 0 if algorithm == "td3" else length
-    sizes = part_sizes(OBSERVATIONS, ACTIONS)
-    actor = init_network(jax.random.key(0), VARIANTS[algorithm].actor, sizes, width, ACTIONS)
+    network = make_part(AGENTS[algorithm], "actor", "lstm", OBSERVATIONS, ACTIONS, width)
+    actor = init_network(jax.random.key(0), network)
     return rtd.Policy(
         actor=actor,
         bounds=Bounds(jnp.full(ACTIONS, -2.0), jnp.full(ACTIONS, 2.0)),

@@ -20,7 +20,7 @@ from collections.abc import Iterator
 import jax
 
 from experiments.benchmarks.ours import Lanes, make_config
-from rtd3jax.config import ALGORITHMS
+from rtd3jax.agents.variants import ALGORITHMS
 from rtd3jax.training.lanes import workers
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))

@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 
 from experiments.benchmarks.ours import make_config
 from experiments.benchmarks.torch_processes import ONE_PROCESS, PROCESS_PER_CORE
-from rtd3jax.config import ALGORITHMS
+from rtd3jax.agents.variants import ALGORITHMS
 from rtd3jax.files import write_bytes_atomically
-from rtd3jax.study.figures import COLOURS
+from rtd3jax.study.colours import colour_of
 from rtd3jax.study.plan import update_flops
 
 COLUMNS = ["agent", "history_length", "measurement", "repeat", "value", "machine"]
@@ -349,4 +349,4 @@ def _draw(axes, agent: str, points: list[tuple[int, Spread]], lengths: list[int]
     middle = np.array([s.median for s in shown])
     error = np.array([[s.median - s.low for s in shown], [s.high - s.median for s in shown]])
     axes.errorbar(x, middle, error, linestyle=dashes, marker="o", markersize=3, capsize=2,
-                  color=COLOURS[agent], label=agent)  # fmt: skip
+                  color=colour_of(agent), label=agent)  # fmt: skip

@@ -13,7 +13,8 @@ from torch import nn
 from torch.nn import functional
 
 from experiments.benchmarks.numpy_world import Batch, Window
-from rtd3jax.agents.variants import NetworkSpec, Variant
+from rtd3jax.agents.networks import NetworkSpec
+from rtd3jax.agents.variants import Variant
 
 # The input gate of a token that does not exist: its sigmoid is exactly zero.
 _SHUT = -1e4
@@ -103,7 +104,7 @@ class Network(nn.Module):
 
 
 class Learner:
-    """Networks, targets and optimisers of one seed; `rtd3jax.agents.td3`'s updates."""
+    """Networks, targets and optimisers of one seed; `rtd3jax.agents.learners.td3`'s updates."""
 
     def __init__(
         self,

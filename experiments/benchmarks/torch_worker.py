@@ -32,7 +32,7 @@ from experiments.benchmarks.torch_reference import (
     tensors,
     window_tensors,
 )
-from rtd3jax.agents.variants import VARIANTS
+from rtd3jax.registries import AGENTS
 
 _TURN = 8
 """Steps of a seed before it is the next one's turn: its weights stay in the cache meanwhile."""
@@ -55,7 +55,7 @@ class Seed:
     ):
         torch.manual_seed(seed)
         self._random = np.random.default_rng(seed)
-        variant = VARIANTS[agent]
+        variant = AGENTS[agent]
         self._length, self._batch, self._starts = history_length, batch, learning_starts
         self._delay, self._exploration = policy_delay, exploration_noise
         self._keeps_carry = variant.stores_carry

@@ -1,106 +1,233 @@
-"""Actor and critic: encoder, memory, head (paper, Table 4: "Structure").
+"""Actor and critic: encoder, memory, head (paper, Table 4: "Structure"), as flax modules.
 
-Shapes: ``L`` past tokens, ``B`` batch, ``O`` and ``A`` sizes of an observation and an action, ``H``
-width.
+A `Network` is put together from modules, each of which can be another: its fields are the names
+under which the parameters stand. Shapes: ``L`` past tokens, ``B`` batch, ``O`` and ``A`` sizes of
+an observation and an action, ``H`` width.
 """
 
+import dataclasses
 from typing import Any
 
+import chex
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from rtd3jax.agents.lstm import Carry, init_lstm, lstm
+from rtd3jax.agents.history import Steps, Window
+from rtd3jax.agents.memory.base import Carry, Memory, Params, check_memory
 from rtd3jax.agents.products import matmul
-from rtd3jax.agents.variants import VARIANTS, NetworkSpec
-from rtd3jax.agents.windows import Steps, Window
-from rtd3jax.config import ALGORITHMS
-from rtd3jax.errors import UserError, nearest
-
-Params = dict[str, Any]
+from rtd3jax.errors import UserError, first_line
+from rtd3jax.registries import MEMORIES
 
 
-def init_network(
-    key: jax.Array, spec: NetworkSpec, sizes: dict[str, int], width: int, outputs: int
-) -> Params:
-    """Parameters of one network.
+@dataclasses.dataclass(frozen=True)
+class NetworkSpec:
+    """What one network reads.
+
+    Attributes:
+        memory: parts of each token of the recurrent stream; empty for none.
+        memory_has_current: whether that stream ends with the current token.
+        current: parts of the input of the feed-forward stream; empty for none.
+        carry_from_replay: whether the memory starts from the behaviour actor's stored carry instead
+            of reading the past tokens itself (h-td3's critic).
+    """
+
+    memory: tuple[str, ...] = ()
+    memory_has_current: bool = False
+    current: tuple[str, ...] = ()
+    carry_from_replay: bool = False
+
+
+class Linear(nn.Module):
+    """``x @ kernel + bias`` [B, outputs]; uniform in ±1/sqrt(inputs) at the start.
+
+    Attributes:
+        inputs: elements of an input.
+        outputs: elements of an output.
+        precision: of a wide product's factors; None for a narrow product, whose factors are never
+            rounded: an observation costs little and would lose most.
+    """
+
+    inputs: int
+    outputs: int
+    precision: str | None = None
+
+    def setup(self) -> None:
+        self.kernel = self.param("kernel", lambda key: self.initial(key)["kernel"])
+        self.bias = self.param("bias", lambda key: self.initial(key)["bias"])
+
+    def initial(self, key: jax.Array) -> Params:
+        """The initialisation that the stack of the paper's parameter counts implies."""
+        bound = self.inputs**-0.5
+        shape = (self.inputs, self.outputs)
+        kernel_key, bias_key = jax.random.split(key)
+        return {
+            "kernel": jax.random.uniform(kernel_key, shape, jnp.float32, -bound, bound),
+            "bias": jax.random.uniform(bias_key, shape[1:], jnp.float32, -bound, bound),
+        }
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """The output [B, outputs] for ``x`` [B, inputs]."""
+        if self.precision is None:
+            return x @ self.kernel + self.bias[None, :]
+        return matmul(x, self.kernel, self.precision) + self.bias[None, :]
+
+
+class Network(nn.Module):
+    """An actor or a critic.
+
+    Attributes:
+        reads: what it reads.
+        head: from the features of its streams to H.
+        output: from H to the outputs.
+        encoder: of each token of the recurrent stream, before its ReLU; None without that stream.
+        memory: the recurrent stream's; None without it.
+        current: of the feed-forward stream, before its ReLU; None without it.
+    """
+
+    reads: NetworkSpec
+    head: Linear
+    output: Linear
+    encoder: nn.Module | None = None
+    memory: Memory | None = None
+    current: nn.Module | None = None
+
+    def __call__(
+        self, window: Window, action: jax.Array | None = None, carry: Carry | None = None
+    ) -> jax.Array:
+        """The output [B, outputs].
+
+        Args:
+            window: of the step.
+            action: [B, A], the current action; critics need it.
+            carry: the carry after the past tokens, where it is known; they are not read then.
+        """
+        feature = current = None
+        if self.reads.memory:
+            feature = self._remember(window, action, carry)
+        if self.reads.current:
+            current = current_token(self.reads.current, window, action)
+        return self.from_features(feature, current)
+
+    def from_features(self, feature: jax.Array | None, current: jax.Array | None) -> jax.Array:
+        """The output [B, outputs] of the memory's ``feature`` [B, H] and the ``current`` token."""
+        features = [] if feature is None else [feature]
+        if current is not None:
+            assert self.current is not None
+            features.append(jax.nn.relu(self.current(current)))
+        hidden = self.head(jnp.concatenate(features, axis=-1))
+        return self.output(jax.nn.relu(hidden))
+
+    def carry_before(self, window: Window) -> Carry:
+        """The memory's carry after the window's past tokens, before the current one."""
+        assert self.memory is not None
+        encoded = self.encode(past_tokens(self.reads.memory, window.past))
+        return self.memory.end(None, encoded, window.exists)
+
+    def zero_carry(self, batch: int) -> Carry:
+        """The memory's carry before any token; None without a memory."""
+        return None if self.memory is None else self.memory.zero(batch)
+
+    def encode(self, tokens: jax.Array) -> jax.Array:
+        """Every token [T, B, parts], encoded: [T, B, H]."""
+        assert self.encoder is not None
+        flat = jax.nn.relu(self.encoder(tokens.reshape(-1, tokens.shape[-1])))
+        return flat.reshape(*tokens.shape[:2], flat.shape[-1])
+
+    def _remember(self, window: Window, action: jax.Array | None, carry: Carry | None) -> jax.Array:
+        """The memory's feature [B, H]: its output after the stream's last token."""
+        assert self.memory is not None
+        if not self.reads.memory_has_current:
+            return self.memory.read(self.carry_before(window) if carry is None else carry)
+        current = current_token(self.reads.memory, window, action)[None]
+        present = jnp.ones((1, current.shape[1]), bool)
+        if carry is not None:
+            return self.memory.read(self.memory.end(carry, self.encode(current), present))
+        past = past_tokens(self.reads.memory, window.past)
+        tokens = jnp.concatenate((past, current))
+        exists = jnp.concatenate((window.exists, present))
+        return self.memory.read(self.memory.end(None, self.encode(tokens), exists))
+
+
+def make_network(
+    reads: NetworkSpec,
+    memory: str,
+    sizes: dict[str, int],
+    width: int,
+    outputs: int,
+    precision: str = "float32",
+    encoder: type[nn.Module] = Linear,
+) -> Network:
+    """The network of an agent.
 
     Args:
-        key: consumed here.
-        spec: what the network reads.
+        reads: what it reads.
+        memory: its name, as registered.
         sizes: elements of each part: ``observation``, ``action``, ``previous_action``.
         width: H.
         outputs: elements of its output: A for an actor, 1 for a critic.
+        precision: of its wide products' factors; see `rtd3jax.agents.products`.
+        encoder: called with ``inputs`` and ``outputs``, the module of each stream's first layer.
+
+    Raises:
+        UserError: when the memory or the encoder does not keep to its interface.
     """
-    names = ("encoder", "lstm", "current", "head", "output")
+    modules: dict[str, Any] = {}
+    features = 0
+    if reads.memory:
+        inputs = sum(sizes[part] for part in reads.memory)
+        modules["encoder"] = encoder(inputs=inputs, outputs=width)
+        modules["memory"] = MEMORIES[memory](inputs=width, width=width, precision=precision)
+        check_memory(memory, modules["memory"])
+        features += width
+    if reads.current:
+        inputs = sum(sizes[part] for part in reads.current)
+        modules["current"] = encoder(inputs=inputs, outputs=width)
+        features += width
+    head, output = Linear(features, width, precision), Linear(width, outputs)
+    network = Network(reads=reads, head=head, output=output, **modules)
+    for name in ("encoder", "current"):
+        if name in modules:
+            _check_encoder(modules[name], width)
+    return network
+
+
+def init_network(key: jax.Array, network: Network) -> Params:
+    """Parameters of ``network`` at the start of training, under the names of its fields."""
+    names = ("encoder", "memory", "current", "head", "output")
     keys = dict(zip(names, jax.random.split(key, len(names)), strict=True))
     params: Params = {}
-    features = 0
-    if spec.memory:
-        inputs = sum(sizes[part] for part in spec.memory)
-        params["encoder"] = _init_linear(keys["encoder"], inputs, width)
-        params["lstm"] = init_lstm(keys["lstm"], width, width)
-        features += width
-    if spec.current:
-        inputs = sum(sizes[part] for part in spec.current)
-        params["current"] = _init_linear(keys["current"], inputs, width)
-        features += width
-    params["head"] = _init_linear(keys["head"], features, width)
-    params["output"] = _init_linear(keys["output"], width, outputs)
+    for name in names:
+        module = getattr(network, name)
+        if module is not None:
+            params[name] = _initial(module, keys[name])
     return params
 
 
-def carry_before(params: Params, spec: NetworkSpec, window: Window) -> Carry:
-    """The LSTM's carry after the window's past tokens, before the current one."""
-    encoded = _encode(params, _past_tokens(spec, window))
-    return lstm(params["lstm"], encoded, window.exists, precision=spec.precision)
-
-
 def apply_network(
+    network: Network,
     params: Params,
-    spec: NetworkSpec,
     window: Window,
     action: jax.Array | None = None,
     carry: Carry | None = None,
 ) -> jax.Array:
-    """The network's output: [B, outputs].
-
-    Args:
-        params: of `init_network`.
-        spec: what the network reads.
-        window: of the step.
-        action: [B, A], the current action; critics need it.
-        carry: the carry after the past tokens, where it is known already; they are not read then.
-    """
-    features = []
-    if spec.memory:
-        features.append(_memory(params, spec, window, action, carry))
-    if spec.current:
-        current = _current_token(spec.current, window, action)
-        features.append(jax.nn.relu(_linear(params["current"], current)))
-    head = params["head"]
-    hidden = matmul(jnp.concatenate(features, axis=-1), head["kernel"], spec.precision)
-    return _linear(params["output"], jax.nn.relu(hidden + head["bias"][None, :]))
+    """The network's output [B, outputs] with ``params``; see `Network`."""
+    chex.assert_rank((window.observation, window.previous_action, window.past.action), (2, 2, 3))
+    if action is not None:
+        chex.assert_equal_shape((action, window.previous_action))
+    output = network.apply({"params": params}, window, action, carry)
+    assert isinstance(output, jax.Array)  # and no mutable collections beside it
+    return output
 
 
-def count_parameters(
-    algorithm: str, obs_dim: int, act_dim: int, hidden_size: int = 128
-) -> dict[str, int]:
-    """Numbers of parameters of one actor and one critic, counted from initialised ones.
+def act(actor: Network, params: Params, window: Window, carry: Carry | None = None) -> jax.Array:
+    """The deterministic action [B, A] of an actor, in half ranges: tanh of the output."""
+    return jnp.tanh(apply_network(actor, params, window, carry=carry))
 
-    ``count_parameters("lstm-td3", obs_dim=3, act_dim=1)`` gives the paper's Table 5.
-    """
-    if algorithm not in ALGORITHMS:
-        raise UserError(f"algorithm {algorithm!r} is unknown{nearest(algorithm, ALGORITHMS)}")
-    sizes = part_sizes(obs_dim, act_dim)
-    variant = VARIANTS[algorithm]
 
-    def count(spec: NetworkSpec, outputs: int) -> int:
-        params = jax.eval_shape(
-            lambda: init_network(jax.random.key(0), spec, sizes, hidden_size, outputs)
-        )
-        return sum(leaf.size for leaf in jax.tree.leaves(params))
-
-    return {"actor": count(variant.actor, act_dim), "critic": count(variant.critic, 1)}
+def carry_before(network: Network, params: Params, window: Window) -> Carry:
+    """The carry after the window's past tokens, before the current one."""
+    return network.apply({"params": params}, window, method="carry_before")
 
 
 def part_sizes(observation_size: int, action_size: int) -> dict[str, int]:
@@ -112,32 +239,13 @@ def part_sizes(observation_size: int, action_size: int) -> dict[str, int]:
     }
 
 
-def _memory(
-    params: Params,
-    spec: NetworkSpec,
-    window: Window,
-    action: jax.Array | None,
-    carry: Carry | None,
-) -> jax.Array:
-    """The memory's feature [B, H]: the last hidden state."""
-    if not spec.memory_has_current:
-        return (carry_before(params, spec, window) if carry is None else carry).hidden
-    current = _current_token(spec.memory, window, action)[None]
-    present = jnp.ones((1, current.shape[1]), bool)
-    if carry is not None:
-        encoded = _encode(params, current)
-        return lstm(params["lstm"], encoded, present, carry, spec.precision).hidden
-    tokens = jnp.concatenate((_past_tokens(spec, window), current))
-    exists = jnp.concatenate((window.exists, present))
-    return lstm(params["lstm"], _encode(params, tokens), exists, precision=spec.precision).hidden
+def past_tokens(parts: tuple[str, ...], steps: Steps) -> jax.Array:
+    """The tokens [..., parts] of ``steps``, leaves [..., O] and [..., A]."""
+    return jnp.concatenate([getattr(steps, part) for part in parts], axis=-1)
 
 
-def _past_tokens(spec: NetworkSpec, window: Window) -> jax.Array:
-    past: Steps = window.past
-    return jnp.concatenate([getattr(past, part) for part in spec.memory], axis=-1)
-
-
-def _current_token(parts: tuple[str, ...], window: Window, action: jax.Array | None) -> jax.Array:
+def current_token(parts: tuple[str, ...], window: Window, action: jax.Array | None) -> jax.Array:
+    """The token [B, parts] of the present step."""
     values: dict[str, Any] = {
         "observation": window.observation,
         "previous_action": window.previous_action,
@@ -146,22 +254,28 @@ def _current_token(parts: tuple[str, ...], window: Window, action: jax.Array | N
     return jnp.concatenate([values[part] for part in parts], axis=-1)
 
 
-def _encode(params: Params, tokens: jax.Array) -> jax.Array:
-    """Linear-ReLU of every token: [T, B, parts] to [T, B, H]."""
-    flat = jax.nn.relu(_linear(params["encoder"], tokens.reshape(-1, tokens.shape[-1])))
-    return flat.reshape(*tokens.shape[:2], flat.shape[-1])
+def _initial(module: nn.Module, key: jax.Array) -> Params:
+    """A part's parameters: by its own ``initial``, or as flax draws them."""
+    if isinstance(module, Linear | Memory):
+        return module.initial(key)
+    return module.init(key, _example(module, 1)).get("params", {})
 
 
-def _init_linear(key: jax.Array, inputs: int, outputs: int) -> Params:
-    """Uniform in ±1/sqrt(inputs), the initialisation that the parameter counts' stack implies."""
-    bound = inputs**-0.5
-    kernel_key, bias_key = jax.random.split(key)
-    return {
-        "kernel": jax.random.uniform(kernel_key, (inputs, outputs), jnp.float32, -bound, bound),
-        "bias": jax.random.uniform(bias_key, (outputs,), jnp.float32, -bound, bound),
-    }
+def _example(module: nn.Module, batch: int) -> jax.Array:
+    return jnp.zeros((batch, module.inputs), jnp.float32)
 
 
-def _linear(params: Params, x: jax.Array) -> jax.Array:
-    # Always in float32: narrow inputs (an observation) cost little and would lose most.
-    return x @ params["kernel"] + params["bias"][None, :]
+def _check_encoder(module: nn.Module, width: int) -> None:
+    """Raise UserError, before anything is compiled, unless the module gives what it should."""
+    name = type(module).__name__
+    try:
+        given = jax.eval_shape(
+            lambda: module.init_with_output(jax.random.key(0), _example(module, 2))[0]
+        )
+    except Exception as error:  # the user's own code, which may raise anything
+        raise UserError(f"encoder {name} failed: {first_line(error)}") from error
+    if (given.shape, given.dtype) != ((2, width), jnp.float32):
+        raise UserError(
+            f"encoder {name} must give float32 [batch, {width}], not "
+            f"{given.dtype}{list(given.shape)} for a batch of 2"
+        )

@@ -1,25 +1,28 @@
 """A lane's replay: a ring of transitions, and batches of windows cut from it.
 
 Every environment step writes one row, so a row's number is the lane's step and the ring needs no
-counter of its own. Shapes: ``C`` capacity, ``B`` batch, ``H`` width.
+counter of its own. Where an agent's critics start from the behaviour actor's carries (h-td3), the
+ring keeps these too; what that asks of the order of reads and writes is dealt with here alone.
+Shapes: ``C`` capacity, ``B`` batch, ``H`` width.
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from rtd3jax.agents.lstm import Carry
-from rtd3jax.agents.windows import (
+from rtd3jax.agents.history import (
     Steps,
     Window,
     empty_steps,
     next_window,
-    past_tokens,
     put_row,
     put_step,
+    window_at,
 )
+from rtd3jax.agents.memory.base import Carry
 
 
 @struct.dataclass
@@ -48,7 +51,7 @@ class Replay:
 
     Attributes:
         transitions: leaves [C, ...].
-        carries: h-td3 only, leaves [C + 1, H]: slot n % (C + 1) holds the behaviour actor's carry
+        carries: None, or leaves [C + 1, ...]: slot n % (C + 1) holds the behaviour actor's carry
             before step n's current token, that is the carry *of* row n and the *next* carry of row
             n - 1. An episode's first step has no past, so its carry is zero and its slot is free
             for the carry that belongs to the final observation of the episode before.
@@ -72,9 +75,9 @@ class Batch:
 
 
 def empty_replay(
-    capacity: int, observation_size: int, action_size: int, carry_width: int | None
+    capacity: int, observation_size: int, action_size: int, carry: Carry | None
 ) -> Replay:
-    """A ring of ``capacity`` rows; with carries of ``carry_width`` unless that is None."""
+    """A ring of ``capacity`` rows; with carries like ``carry`` (leaves [1, ...]), unless None."""
     transitions = Transition(
         step=empty_steps(capacity, observation_size, action_size),
         reward=jnp.zeros((capacity,), jnp.float32),
@@ -82,10 +85,42 @@ def empty_replay(
         terminated=jnp.zeros((capacity,), bool),
         age=jnp.zeros((capacity,), jnp.int32),
     )
-    carries = None
-    if carry_width is not None:
-        carries = Carry(*(jnp.zeros((capacity + 1, carry_width), jnp.float32) for _ in range(2)))
+    carries = jax.tree.map(
+        lambda leaf: jnp.zeros((capacity + 1, *leaf.shape[1:]), jnp.float32), carry
+    )
     return Replay(transitions, carries)
+
+
+def present_window(
+    replay: Replay,
+    step: jax.Array,
+    age: jax.Array,
+    observation: jax.Array,
+    previous_action: jax.Array,
+    tokens: int,
+    history_length: jax.Array | int,
+) -> Window:
+    """The window of step ``step`` (int32 []), which is not written yet: a batch of one.
+
+    Args:
+        replay: the ring, with all steps before.
+        step: the step's number.
+        age: int32 [], steps of the same episode before it.
+        observation: [O], seen at it.
+        previous_action: [A], before it.
+        tokens: L, past tokens in the window's arrays.
+        history_length: l <= L, past tokens that may be read.
+    """
+    return window_at(
+        replay.transitions.step,
+        step[None],
+        age[None],
+        step,
+        tokens,
+        history_length,
+        observation[None],
+        previous_action[None],
+    )
 
 
 def put_transition(replay: Replay, number: jax.Array, row: Transition) -> Replay:
@@ -105,13 +140,77 @@ def put_transition(replay: Replay, number: jax.Array, row: Transition) -> Replay
 
 
 def put_carry(replay: Replay, number: jax.Array, carry: Carry) -> Replay:
-    """The ring with the behaviour actor's carry (leaves [H]) before step ``number``."""
-    assert replay.carries is not None
-    slot = number % replay.carries.hidden.shape[0]
-    carries = Carry(
-        *(put_row(kept, slot, row) for kept, row in zip(replay.carries, carry, strict=True))
-    )
+    """The ring with the behaviour actor's carry (leaves [...]) before step ``number``."""
+    slot = _carry_slot(replay.carries, number)
+    carries = jax.tree.map(lambda kept, row: put_row(kept, slot, row), replay.carries, carry)
     return dataclasses.replace(replay, carries=carries)
+
+
+def keep_acting_carry(
+    replay: Replay, step: jax.Array, age: jax.Array, carry: Carry | None
+) -> Replay:
+    """Keep the carry (leaves [1, ...]) with which step ``step`` acts; before it is learned from.
+
+    Not an episode's first one: its slot holds the carry of the last episode's final observation.
+    """
+    if replay.carries is None:
+        return replay
+    slot = _carry_slot(replay.carries, step)
+    row = jax.tree.map(
+        lambda kept, new: jnp.where(age == 0, kept[slot], new[0]), replay.carries, carry
+    )
+    return put_carry(replay, step, row)
+
+
+def store(
+    replay: Replay,
+    step: jax.Array,
+    row: Transition,
+    done: jax.Array,
+    final_carry: Callable[[], Carry],
+    never: jax.Array,
+) -> Replay:
+    """The ring after step ``step``, whose updates have read it.
+
+    Args:
+        replay: the ring.
+        step: int32 [].
+        row: the transition.
+        done: bool [], whether the episode ended with it.
+        final_carry: gives the behaviour actor's carry, leaves [1, ...], before the final
+            observation; called where the ring keeps carries.
+        never: bool [], false, computed from what the updates read; see `_after`.
+    """
+    replay = put_transition(replay, _after(step, never), row)
+    if replay.carries is None:
+        return replay
+    # Within an episode the next step's own carry takes this slot.
+    carry = jax.lax.cond(
+        done,
+        final_carry,
+        lambda: jax.tree.map(
+            lambda kept: jnp.zeros((1, *kept.shape[1:]), kept.dtype), replay.carries
+        ),
+    )
+    return put_carry(replay, step + 1, jax.tree.map(lambda leaf: leaf[0], carry))
+
+
+@jax.custom_batching.custom_vmap
+def _after(number: jax.Array, never: jax.Array) -> jax.Array:
+    """``number``, but known only when ``never`` (always false) is.
+
+    A row that is written by it is written after what ``never`` was computed from has read the
+    ring. Where XLA sees no such order, it copies the whole ring at every step to be safe; an
+    optimization barrier does not tell it, since that is removed before copies are decided upon.
+    """
+    return number + never.astype(number.dtype)
+
+
+@_after.def_vmap
+def _after_of_lanes(axis_size, batched, number, never):
+    # One number for all lanes, lest the write become a scatter.
+    assert not batched[0]
+    return _after(number, jnp.any(never)), False
 
 
 def sample(
@@ -149,19 +248,26 @@ def gather(
     kept = replay.transitions
     slot = number % kept.reward.shape[0]
     age = kept.age[slot]
-    past, length = past_tokens(kept.step, number, age, count, tokens)
-    window = Window(
-        past=past,
-        length=jnp.minimum(length, history_length).astype(jnp.int32),
-        observation=kept.step.observation[slot],
-        previous_action=kept.step.previous_action[slot],
+    window = window_at(
+        kept.step,
+        number,
+        age,
+        count,
+        tokens,
+        history_length,
+        kept.step.observation[slot],
+        kept.step.previous_action[slot],
     )
     action = kept.step.action[slot]
     carry = next_carry = None
     if replay.carries is not None:
         carry = _carry_at(replay.carries, number)
-        first = (age == 0)[:, None]
-        carry = Carry(*(jnp.where(first, jnp.zeros_like(part), part) for part in carry))
+        carry = jax.tree.map(
+            lambda part: jnp.where(
+                (age == 0).reshape(-1, *[1] * (part.ndim - 1)), jnp.zeros_like(part), part
+            ),
+            carry,
+        )
         next_carry = _carry_at(replay.carries, number + 1)
     return Batch(
         window=window,
@@ -175,5 +281,9 @@ def gather(
 
 
 def _carry_at(carries: Carry, number: jax.Array) -> Carry:
-    slot = number % carries.hidden.shape[0]
-    return Carry(*(kept[slot].astype(jnp.float32) for kept in carries))
+    slot = _carry_slot(carries, number)
+    return jax.tree.map(lambda kept: kept[slot], carries)
+
+
+def _carry_slot(carries: Carry, number: jax.Array) -> jax.Array:
+    return number % jax.tree.leaves(carries)[0].shape[0]

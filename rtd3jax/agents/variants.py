@@ -1,89 +1,151 @@
-"""The six agents as data: which tokens go to which stream (paper, Sections 2, 4 and 5; Table 4).
+"""The agents as data: everything that one agent differs in from another (paper, Sections 2, 4, 5).
 
 A network has up to two streams whose features are concatenated before its head:
 
-* *memory*: Linear-ReLU-LSTM over a window of tokens;
+* *memory*: Linear-ReLU-memory over a window of tokens;
 * *current*: Linear-ReLU on the present step alone.
 
 ``td3`` is the network without memory; the recurrent agents differ only in what is read where.
 """
 
 import dataclasses
+from typing import Any
 
-from rtd3jax.config import ALGORITHMS
-
-
-@dataclasses.dataclass(frozen=True)
-class NetworkSpec:
-    """What one network reads.
-
-    Attributes:
-        memory: parts of each token of the recurrent stream; empty for none.
-        memory_has_current: whether that stream ends with the current token.
-        current: parts of the input of the feed-forward stream; empty for none.
-        carry_from_replay: whether the LSTM starts from the behaviour actor's stored carry instead
-            of reading the past tokens itself (h-td3's critic).
-        precision: of its wide products' factors; see `rtd3jax.agents.products`.
-    """
-
-    memory: tuple[str, ...] = ()
-    memory_has_current: bool = False
-    current: tuple[str, ...] = ()
-    carry_from_replay: bool = False
-    precision: str = "float32"
+from rtd3jax.agents.networks import Linear, NetworkSpec
+from rtd3jax.errors import UserError
+from rtd3jax.registries import AGENTS, LEARNERS
 
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """An agent: what its actor and its critics read."""
+    """An agent.
+
+    Attributes:
+        actor: what its actor reads.
+        critic: what its critics read.
+        learner: what trains them, as registered.
+        colour: of its curves; one is chosen where it is None.
+        colour_on_dark: on a dark page, where another is needed.
+        peak_arrays: arrays of [l + 1, B, H] that are alive at an update's peak, for the plan of
+            memory: what XLA reserves for the compiled loop on a CPU, divided by their size.
+        encoder: the module of each stream's first layer, called with ``inputs`` and ``outputs``.
+    """
 
     actor: NetworkSpec
     critic: NetworkSpec
+    learner: str = "td3"
+    colour: str | None = None
+    colour_on_dark: str | None = None
+    peak_arrays: float = 30.0
+    encoder: Any = Linear
+
+    @property
+    def has_window(self) -> bool:
+        """Whether it reads past steps, so that a history length means something."""
+        return bool(self.actor.memory or self.critic.memory)
 
     @property
     def stores_carry(self) -> bool:
-        """Whether replay keeps the behaviour actor's LSTM carries."""
+        """Whether replay keeps the behaviour actor's carries."""
         return self.critic.carry_from_replay
-
-    def at(self, precision: str) -> "Variant":
-        """The same agent with wide products in ``precision``."""
-        return Variant(
-            dataclasses.replace(self.actor, precision=precision),
-            dataclasses.replace(self.critic, precision=precision),
-        )
 
 
 _O = "observation"
 _A = "action"
 _P = "previous_action"
+PARTS = (_O, _A, _P)
 
 _ONE_HEADED_ACTOR = NetworkSpec(memory=(_O, _P), memory_has_current=True)
 
-VARIANTS: dict[str, Variant] = {
+# Colours that remain apart for colour-blind readers: the palette of Okabe and Ito, "Color Universal
+# Design" (2008), less its yellow, which is too light for a line on white.
+_PAPER: dict[str, Variant] = {
     "td3": Variant(
         actor=NetworkSpec(current=(_O,)),
         critic=NetworkSpec(current=(_O, _A)),
+        colour="#000000",
+        colour_on_dark="#F2F2F2",
+        peak_arrays=5.0,
     ),
     "lstm-td3": Variant(
         actor=NetworkSpec(memory=(_O, _A), current=(_O,)),
         critic=NetworkSpec(memory=(_O, _A), current=(_O, _A)),
+        colour="#0072B2",
+        colour_on_dark="#3D9BE0",
+        peak_arrays=21.5,
     ),
     "lstm-td3-no-action": Variant(
         actor=NetworkSpec(memory=(_O,), current=(_O,)),
         critic=NetworkSpec(memory=(_O,), current=(_O, _A)),
+        colour="#E69F00",
+        peak_arrays=21.0,
     ),
     "lstm-td3-1ha1hc": Variant(
         actor=_ONE_HEADED_ACTOR,
         critic=NetworkSpec(memory=(_O, _A), memory_has_current=True),
+        colour="#009E73",
+        peak_arrays=22.5,
     ),
     "lstm-td3-1ha2hc": Variant(
         actor=_ONE_HEADED_ACTOR,
         critic=NetworkSpec(memory=(_O, _P), memory_has_current=True, current=(_A,)),
+        colour="#CC79A7",
+        peak_arrays=22.5,
     ),
     "h-td3": Variant(
         actor=_ONE_HEADED_ACTOR,
         critic=NetworkSpec(memory=(_O, _A), memory_has_current=True, carry_from_replay=True),
+        colour="#D55E00",
+        peak_arrays=19.0,
     ),
 }
 
-assert tuple(VARIANTS) == ALGORITHMS
+ALGORITHMS = tuple(_PAPER)
+"""The six agents of the paper."""
+
+
+def register_agent(name: str, variant: Variant, *, replace: bool = False) -> None:
+    """Add an agent, which ``Config(algorithm=name)`` then chooses.
+
+    Args:
+        name: by which the configuration, tables and saved files know it.
+        variant: what it is.
+        replace: whether it may take the place of another of that name.
+
+    Raises:
+        UserError: when the name is taken, or ``variant`` cannot be trained.
+    """
+    if not isinstance(variant, Variant):
+        raise UserError(f"agent {name!r} must be an rtd.Variant, not {variant!r}")
+    _check(name, variant)
+    AGENTS.register(name, variant, replace=replace)
+
+
+def _check(name: str, variant: Variant) -> None:
+    """Raise UserError unless actor and critic read what there is when they act."""
+    LEARNERS.check(variant.learner)
+    actor, critic = variant.actor, variant.critic
+    for role, reads in (("actor", actor), ("critic", critic)):
+        if not reads.memory and not reads.current:
+            raise UserError(f"agent {name!r}: its {role} reads nothing")
+        for part in (*reads.memory, *reads.current):
+            if part not in PARTS:
+                raise UserError(
+                    f"agent {name!r}: its {role} reads {part!r}; the parts are {', '.join(PARTS)}"
+                )
+    if _A in actor.current or (_A in actor.memory and actor.memory_has_current):
+        raise UserError(
+            f"agent {name!r}: its actor reads the action that it is to choose; give it "
+            "'previous_action', or end its memory before the current step"
+        )
+    if _A not in critic.current and not (_A in critic.memory and critic.memory_has_current):
+        raise UserError(f"agent {name!r}: its critic does not read the current action")
+    if critic.carry_from_replay and not (actor.memory and critic.memory):
+        raise UserError(
+            f"agent {name!r}: a critic that starts from the actor's carry needs a memory, as its "
+            "actor does"
+        )
+
+
+for _name, _variant in _PAPER.items():
+    register_agent(_name, _variant)

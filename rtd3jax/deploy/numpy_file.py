@@ -3,7 +3,7 @@
 import base64
 import importlib.resources
 
-from rtd3jax.deploy.model import Model
+from rtd3jax.deploy.model import Model, check_portable
 
 _ABOUT = "ABOUT: dict[str, Any] = {}\n"
 _WEIGHTS = 'WEIGHTS = ""\n'
@@ -11,6 +11,7 @@ _WEIGHTS = 'WEIGHTS = ""\n'
 
 def numpy_bytes(model: Model) -> bytes:
     """The source of a module with a class ``Player``: ``reset()``, ``step(observation)``."""
+    check_portable(model, "numpy")
     shapes = {name: list(array.shape) for name, array in model.arrays.items()}
     raw = b"".join(array.astype("<f4").tobytes() for array in model.arrays.values())
     about = repr({**model.header(), "arrays": shapes})

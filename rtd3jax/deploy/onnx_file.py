@@ -4,12 +4,12 @@ Plain operators of opset 17, so that old runtimes play it too.
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-from rtd3jax.deploy.model import Model
+from rtd3jax.deploy.model import Model, check_portable
 from rtd3jax.errors import UserError
 
 _OPSET = 17
@@ -27,6 +27,7 @@ def onnx_bytes(model: Model) -> bytes:
     Raises:
         UserError: when the package onnx is missing.
     """
+    check_portable(model, "onnx")
     try:
         import onnx
     except ImportError as error:
@@ -95,14 +96,14 @@ class _Graph:
 def _build(graph: _Graph, model: Model) -> None:
     features = []
     length = model.history_length
-    hidden = cell = ""
+    carry: list[str] = []
     if model.memory:
         pads = graph.integers(0, 1, 0, 0, 0, 0)  # a zero row in front: the carry that begins now
-        hidden, cell = (graph.add("Pad", [part, pads]) for part in ("hidden", "cell"))
+        carry = [graph.add("Pad", [part, pads]) for part in _CARRIES[model.cell]]
         if model.memory_has_current:
-            hidden, cell = _feed(graph, model, hidden, cell)
-        features.append(_row(graph, hidden, length))
-        hidden, cell = (_rows(graph, part, length) for part in (hidden, cell))
+            carry = _feed(graph, model, carry)
+        features.append(_row(graph, carry[0], length))
+        carry = [_rows(graph, part, length) for part in carry]
     if model.current:
         features.append(graph.add("Relu", [graph.linear("current", graph.join(model.current))]))
     head = graph.add("Relu", [graph.linear("head", graph.join(features))])
@@ -113,18 +114,35 @@ def _build(graph: _Graph, model: Model) -> None:
     if "centre_token" in model.arrays:
         token = graph.add("Add", [token, graph.weight("centre_token")], "shifted_action_token")
     if model.memory and not model.memory_has_current:
-        hidden, cell = _feed(graph, model, hidden, cell, token)
-    following = {"hidden": hidden, "cell": cell, "previous_action": token}
+        carry = _feed(graph, model, carry, token)
+    following = {"previous_action": token}
+    if model.memory:
+        following |= dict(zip(_CARRIES[model.cell], carry, strict=True))
     for name in model.state_shapes:
         graph.add("Identity", [following[name]], f"next_{name}")
 
 
-def _feed(graph: _Graph, model: Model, hidden: str, cell: str, action: str = "") -> tuple[str, str]:
+_CARRIES: dict[str | None, tuple[str, ...]] = {
+    "lstm": ("hidden", "cell"),
+    "gru": ("hidden",),
+    "min-gru": ("hidden",),
+}
+
+
+def _feed(graph: _Graph, model: Model, carry: list[str], action: str = "") -> list[str]:
     """The carries [B, rows, H] after the step's token; ``action`` where a token has it."""
-    width = model.width
     parts = [action if part == "action" else part for part in model.memory]
     token = graph.add("Relu", [graph.linear("encoder", graph.join(parts))])
     token = graph.add("Unsqueeze", [graph.linear("input", token), graph.integers(1)])
+    cells: dict[str | None, Callable[..., list[str]]] = {
+        "lstm": _lstm,
+        "gru": _gru,
+        "min-gru": _min_gru,
+    }
+    return cells[model.cell](graph, model.width, token, *carry)
+
+
+def _lstm(graph: _Graph, width: int, token: str, hidden: str, cell: str) -> list[str]:
     recurrent = graph.add("MatMul", [hidden, graph.weight("recurrent_kernel")])
     gates = graph.add("Add", [recurrent, token])
     graph.add("Split", [gates, graph.integers(3 * width, width)], "ifo", "g", axis=2)
@@ -133,7 +151,28 @@ def _feed(graph: _Graph, model: Model, hidden: str, cell: str, action: str = "")
     kept = graph.add("Mul", ["f", cell])
     added = graph.add("Mul", ["i", graph.add("Tanh", ["g"])])
     cell = graph.add("Add", [kept, added])
-    return graph.add("Mul", ["o", graph.add("Tanh", [cell])]), cell
+    return [graph.add("Mul", ["o", graph.add("Tanh", [cell])]), cell]
+
+
+def _gru(graph: _Graph, width: int, token: str, hidden: str) -> list[str]:
+    recurrent = graph.add("MatMul", [hidden, graph.weight("recurrent_kernel")])
+    recurrent = graph.add("Add", [recurrent, graph.weight("recurrent_bias")])
+    sizes = graph.integers(2 * width, width)
+    graph.add("Split", [token, sizes], "token_gates", "token_candidate", axis=2)
+    graph.add("Split", [recurrent, sizes], "carry_gates", "carry_candidate", axis=2)
+    gates = graph.add("Sigmoid", [graph.add("Add", ["token_gates", "carry_gates"])])
+    graph.add("Split", [gates, graph.integers(width, width)], "reset", "update", axis=2)
+    kept = graph.add("Mul", ["reset", "carry_candidate"])
+    candidate = graph.add("Tanh", [graph.add("Add", ["token_candidate", kept])])
+    change = graph.add("Mul", ["update", graph.add("Sub", [hidden, candidate])])
+    return [graph.add("Add", [candidate, change])]
+
+
+def _min_gru(graph: _Graph, width: int, token: str, hidden: str) -> list[str]:
+    graph.add("Split", [token, graph.integers(width, width)], "gate", "candidate", axis=2)
+    gate = graph.add("Sigmoid", ["gate"])
+    change = graph.add("Sub", [graph.add("Tanh", ["candidate"]), hidden])
+    return [graph.add("Add", [hidden, graph.add("Mul", [gate, change])])]
 
 
 def _row(graph: _Graph, rows: str, index: int) -> str:

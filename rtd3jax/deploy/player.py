@@ -4,9 +4,9 @@
     player.reset()                       # at the start of every episode
     action = player.step(observation)    # once per control step
 
-`ABOUT` says what the policy is. The window that the agent reads is kept as LSTM carries side by
-side, each begun at another of the last steps; one product advances them all, and the last row is
-the one that has read the whole window. Carries of zeros are the start of an episode.
+`ABOUT` says what the policy is. The window that the agent reads is kept as carries of its
+memory side by side, each begun at another of the last steps; one product advances them all, and the
+last row is the one that has read the whole window. Carries of zeros are the start of an episode.
 """
 
 import base64
@@ -42,12 +42,18 @@ class Player:
         self._with_current: bool = about["memory_has_current"]
         if about["memory"]:
             width = arrays["head_bias"].size
-            # sigmoid(x) = tanh(x / 2) / 2 + 1/2: halved here, all four gates are one tanh.
-            half = np.repeat(np.array([0.5, 0.5, 0.5, 1.0], np.float32), width)
+            self._advance = {"lstm": self._lstm, "gru": self._gru, "min-gru": self._min_gru}[
+                about["cell"]
+            ]
+            # sigmoid(x) = tanh(x / 2) / 2 + 1/2: halved here, all gates are one tanh.
+            gates = {"lstm": (0.5, 0.5, 0.5, 1.0), "gru": (0.5, 0.5, 1.0), "min-gru": (0.5, 1.0)}
+            half = np.repeat(np.array(gates[about["cell"]], np.float32), width)
             self._input = arrays["input_kernel"] * half, arrays["input_bias"] * half
-            self._recurrent = arrays["recurrent_kernel"] * half
+            if "recurrent_kernel" in arrays:
+                self._recurrent = arrays["recurrent_kernel"] * half
+                self._recurrent_bias = arrays.get("recurrent_bias", np.float32(0.0)) * half
             self._rows = self._length + self._with_current
-            self._gates = np.empty((self._rows, 4 * width), np.float32)
+            self._gates = np.empty((self._rows, half.size), np.float32)
             self._hidden = np.zeros((self._length + 1, width), np.float32)
             self._cell = np.zeros((self._length + 1, width), np.float32)
         self.reset()
@@ -95,20 +101,38 @@ class Player:
         """Give all carries the step's token; the hidden state of the one that began first."""
         kernel, bias = self._input
         token = self._relu("encoder", _join(parts, self.about["memory"])) @ kernel + bias
-        rows, width = self._rows, self._hidden.shape[1]
         # Row 0 is zero for ever: the carry that begins with this token.
-        gates = np.matmul(self._hidden[:rows], self._recurrent, out=self._gates)
+        hidden = self._advance(token, self._hidden[: self._rows])
+        self._hidden[1:] = hidden[: self._length]
+        return hidden[-1]
+
+    def _lstm(self, token: np.ndarray, hidden: np.ndarray) -> np.ndarray:
+        width = hidden.shape[1]
+        gates = np.matmul(hidden, self._recurrent, out=self._gates)
         gates += token
         np.tanh(gates, out=gates)
         sigmoids = gates[:, : 3 * width]
         sigmoids *= 0.5
         sigmoids += 0.5
         i, f, o, g = (gates[:, k * width : (k + 1) * width] for k in range(4))
-        cell = f * self._cell[:rows] + i * g
-        hidden = o * np.tanh(cell)
-        self._hidden[1:] = hidden[: self._length]
+        cell = f * self._cell[: self._rows] + i * g
         self._cell[1:] = cell[: self._length]
-        return hidden[-1]
+        return o * np.tanh(cell)
+
+    def _gru(self, token: np.ndarray, hidden: np.ndarray) -> np.ndarray:
+        width = hidden.shape[1]
+        recurrent = np.matmul(hidden, self._recurrent, out=self._gates)
+        recurrent += self._recurrent_bias
+        gates = 0.5 * np.tanh(token[: 2 * width] + recurrent[:, : 2 * width]) + np.float32(0.5)
+        reset, update = gates[:, :width], gates[:, width:]
+        candidate = np.tanh(token[2 * width :] + reset * recurrent[:, 2 * width :])
+        return candidate + update * (hidden - candidate)
+
+    def _min_gru(self, token: np.ndarray, hidden: np.ndarray) -> np.ndarray:
+        width = hidden.shape[1]
+        squashed = np.tanh(token)
+        gate = 0.5 * squashed[:width] + np.float32(0.5)
+        return hidden + gate * (squashed[width:] - hidden)
 
     def _relu(self, layer: str, x: np.ndarray) -> np.ndarray:
         kernel, bias = self._linear[layer]

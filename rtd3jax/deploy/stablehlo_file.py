@@ -13,7 +13,7 @@ import jax.export
 import jax.numpy as jnp
 import numpy as np
 
-from rtd3jax.deploy.model import Model
+from rtd3jax.deploy.model import Model, carry_shapes
 from rtd3jax.errors import UserError, first_line
 from rtd3jax.files import array_bytes, read_arrays
 
@@ -33,7 +33,6 @@ def stablehlo_bytes(model: Model) -> bytes:
         UserError: when the package flatbuffers is missing.
     """
     _require_flatbuffers()
-    arrays = {name: jnp.asarray(array) for name, array in model.arrays.items()}
     (batch,) = jax.export.symbolic_shape("batch")
 
     def spec(shape: tuple[int, ...]) -> jax.ShapeDtypeStruct:
@@ -42,7 +41,7 @@ def stablehlo_bytes(model: Model) -> bytes:
     def policy_step(state: State, observation: jax.Array) -> tuple[jax.Array, State]:
         # Accelerators would otherwise round products of float32 to fewer bits.
         with jax.default_matmul_precision("highest"):
-            return play(model, arrays, state, observation)
+            return play(model, state, observation)
 
     with _no_source_locations():
         exported = jax.export.export(jax.jit(policy_step), platforms=PLATFORMS)(
@@ -54,50 +53,63 @@ def stablehlo_bytes(model: Model) -> bytes:
     return array_bytes({"program": program}, header)
 
 
-def play(
-    model: Model, arrays: State, state: State, observation: jax.Array
-) -> tuple[jax.Array, State]:
-    """The recurrence of `rtd3jax.deploy.model` for ``observation`` [B, O]."""
+def play(model: Model, state: State, observation: jax.Array) -> tuple[jax.Array, State]:
+    """The recurrence of `rtd3jax.deploy.model` for ``observation`` [B, O]: any memory, any layers.
+
+    The carries that stand side by side are a batch for the memory's own step.
+    """
+    network, variables = model.network, {"params": jax.tree.map(jnp.asarray, model.params)}
+    arrays = {name: jnp.asarray(array) for name, array in model.arrays.items()}
     parts = {"observation": observation}
     if "previous_action" in state:
         parts["previous_action"] = state["previous_action"]
+    batch = observation.shape[0]
 
-    def linear(layer: str, x: jax.Array) -> jax.Array:
-        return x @ arrays[f"{layer}_kernel"] + arrays[f"{layer}_bias"][None, :]
-
-    def feed(hidden: jax.Array, cell: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def feed(carry: list[jax.Array]) -> list[jax.Array]:
         token = jnp.concatenate([parts[part] for part in model.memory], axis=-1)
-        token = linear("input", jax.nn.relu(linear("encoder", token)))
-        gates = hidden @ arrays["recurrent_kernel"] + token[:, None, :]
-        i, f, o, g = jnp.split(gates, 4, axis=-1)
-        cell = jax.nn.sigmoid(f) * cell + jax.nn.sigmoid(i) * jnp.tanh(g)
-        return jax.nn.sigmoid(o) * jnp.tanh(cell), cell
+        encoded = network.apply(variables, token[None], method="encode")[0]
+        rows = carry[0].shape[1]
+        repeated = jnp.repeat(encoded, rows, axis=0)
+        flat = [part.reshape(batch * rows, *part.shape[2:]) for part in carry]
+        after = network.apply(
+            variables,
+            jax.tree.unflatten(structure, flat),
+            repeated,
+            method=lambda m, c, x: m.memory.step(c, x),
+        )
+        return [part.reshape(batch, rows, *part.shape[1:]) for part in jax.tree.leaves(after)]
 
-    features = []
+    names = list(carry_shapes(network))
+    carry: list[jax.Array] = []
+    feature = None
     if model.memory:
-        zero_row = ((0, 0), (1, 0), (0, 0))
-        hidden, cell = (jnp.pad(state[name], zero_row) for name in ("hidden", "cell"))
+        structure = jax.tree.structure(jax.eval_shape(lambda: network.zero_carry(1)))
+        carry = [_with_zero_row(state[name]) for name in names]
         if model.memory_has_current:
-            hidden, cell = feed(hidden, cell)
-        features.append(hidden[:, -1])
-        hidden, cell = hidden[:, :-1], cell[:, :-1]
+            carry = feed(carry)
+        last = jax.tree.unflatten(structure, [part[:, -1] for part in carry])
+        feature = network.apply(variables, last, method=lambda m, c: m.memory.read(c))
+        carry = [part[:, :-1] for part in carry]
+    current = None
     if model.current:
         current = jnp.concatenate([parts[part] for part in model.current], axis=-1)
-        features.append(jax.nn.relu(linear("current", current)))
-    head = jax.nn.relu(linear("head", jnp.concatenate(features, axis=-1)))
-    centre, half_range = arrays["action_centre"], arrays["action_half_range"]
-    token = jnp.tanh(linear("output", head))
-    action = centre[None, :] + half_range[None, :] * token
+    token = jnp.tanh(
+        jnp.asarray(network.apply(variables, feature, current, method="from_features"))
+    )
+    action = arrays["action_centre"][None, :] + arrays["action_half_range"][None, :] * token
     if "centre_token" in arrays:
         token = token + arrays["centre_token"][None, :]
     parts["action"] = token
     if model.memory and not model.memory_has_current:
-        hidden, cell = feed(hidden, cell)
-    following = {"previous_action": token}
-    if model.memory:
-        following |= {"hidden": hidden, "cell": cell}
+        carry = feed(carry)
+    following = {"previous_action": token, **dict(zip(names, carry, strict=True))}
     action = action.reshape(-1, *model.action_shape)
     return action, {name: following[name] for name in model.state_shapes}
+
+
+def _with_zero_row(rows: jax.Array) -> jax.Array:
+    """``rows`` [B, l, ...] behind a row of zeros: the carry that begins now."""
+    return jnp.pad(rows, ((0, 0), (1, 0), *[(0, 0)] * (rows.ndim - 2)))
 
 
 @contextlib.contextmanager

@@ -27,6 +27,11 @@ class Interface:
     action_high: np.ndarray
     """float32 [A]"""
 
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """(O, A)"""
+        return self.observation_size, self.action_size
+
 
 @contextlib.contextmanager
 def foreign_code() -> Iterator[None]:

@@ -18,20 +18,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
+from rtd3jax.study.colours import colour_of, ordered
 from rtd3jax.study.results import REFERENCES, write_bytes_atomically
 from rtd3jax.study.statistics import iqm_bands, seed_means, summarise
 
-# Colours that remain apart for colour-blind readers: the palette of Okabe and Ito, "Color
-# Universal Design", 2008. The order is that of legends and axes.
-COLOURS = {
-    "td3": "#000000",
-    "h-td3": "#D55E00",
-    "lstm-td3": "#0072B2",
-    "lstm-td3-no-action": "#E69F00",
-    "lstm-td3-1ha1hc": "#009E73",
-    "lstm-td3-1ha2hc": "#CC79A7",
-}
-OTHER_COLOUR = "#56B4E9"
 REFERENCE_COLOUR = "#777777"
 REFERENCE_DASHES: dict[str, Any] = {
     "random": (0, (2, 2)),
@@ -39,8 +29,6 @@ REFERENCE_DASHES: dict[str, Any] = {
     "ceiling": "solid",
     "upper bound": (0, (1, 1)),
 }
-# The algorithm without a history window, shown beside every window length.
-WINDOWLESS = "td3"
 MARKERS = "osD^vPX"
 
 # Share of the lower edges of the bands that may fall below a learning-curve panel.
@@ -83,8 +71,8 @@ def learning_curves(
     """
     with mpl.rc_context(_STYLE):
         tasks = _tasks(curves)
-        windows = curves.loc[curves["algorithm"] != WINDOWLESS, "history_length"]
-        lengths = sorted({int(length) for length in windows})
+        # Agents without a window (length 0) are shown beside every length.
+        lengths = sorted({int(length) for length in curves["history_length"]} - {0})
         figure, grid = _panels(len(tasks), max(len(lengths), 1), width=3.6, height=2.7)
         if not tasks:
             _note_empty(grid[0, 0], "no learning curves")
@@ -161,8 +149,7 @@ def _curve_row(
         axes.xaxis.set_major_locator(MaxNLocator(5))
         for name in ordered(of_task["algorithm"]):
             line = of_task[of_task["algorithm"] == name]
-            if name != WINDOWLESS:
-                line = line[line["history_length"] == length]
+            line = line[line["history_length"].isin([0, length])]
             steps, iqm, low, high = _band(line)
             if steps.size == 0:
                 continue
@@ -373,18 +360,6 @@ def _title(tasks: list[tuple[str, str]], task: tuple[str, str]) -> str:
     """The disturbance, with its environment only where the study has several."""
     name = "no disturbance" if task[1] == "none" else task[1]
     return name if len({env for env, _ in tasks}) == 1 else f"{task[0]}: {name}"
-
-
-def ordered(names: Iterable[str]) -> list[str]:
-    """Distinct trained algorithms in the order of COLOURS, unknown ones last."""
-    known = list(COLOURS)
-    distinct = set(names) - set(REFERENCES)
-    return sorted(distinct, key=lambda n: (known.index(n) if n in COLOURS else len(known), n))
-
-
-def colour_of(name: str) -> str:
-    """An algorithm's colour."""
-    return COLOURS.get(name, OTHER_COLOUR)
 
 
 def _markers(lengths: list[int]) -> list[str]:

@@ -6,21 +6,11 @@ from typing import Any
 
 import jax
 
-from rtd3jax.agents.networks import count_parameters
+from rtd3jax.agents.agent import count_parameters
 from rtd3jax.config import Config
 from rtd3jax.errors import UserError
+from rtd3jax.registries import AGENTS
 from rtd3jax.training.lanes import Job, workers
-
-_ARRAYS = {
-    "td3": 5.0,
-    "lstm-td3": 21.5,
-    "lstm-td3-no-action": 21.0,
-    "lstm-td3-1ha1hc": 22.5,
-    "lstm-td3-1ha2hc": 22.5,
-    "h-td3": 19.0,
-}
-"""Arrays of [l + 1, B, H] that are alive at an update's peak: what XLA reserves for the compiled
-loop on a CPU (`memory_analysis`), divided by their size; tests/study/test_memory.py compares."""
 
 _GRADIENTS = 1.3
 """Copies of all parameters that are alive beside them."""
@@ -44,13 +34,15 @@ def state_bytes(job: Job) -> int:
 
 def working_bytes(config: Config, observation_size: int, action_size: int) -> int:
     """Bytes that a lane needs beside its state while it advances: activations and gradients."""
-    tokens = (config.history_length or 0) + 1
+    tokens = config.tokens + 1
     array = 4 * tokens * config.hidden_size
     counts = count_parameters(
-        config.algorithm, observation_size, action_size, hidden_size=config.hidden_size
+        config.algorithm, observation_size, action_size, config.hidden_size, config.memory
     )
     gradients = 4 * (counts["actor"] + 2 * counts["critic"])
-    update = _ARRAYS[config.algorithm] * array * config.batch_size + _GRADIENTS * gradients
+    update = (
+        AGENTS[config.algorithm].peak_arrays * array * config.batch_size + _GRADIENTS * gradients
+    )
     return int(max(update, _ACTING * array * config.eval_episodes))
 
 

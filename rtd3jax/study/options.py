@@ -9,9 +9,11 @@ from typing import Any, NoReturn
 
 import jax
 
-from rtd3jax.config import ALGORITHMS, Config
+from rtd3jax.agents.variants import ALGORITHMS
+from rtd3jax.config import Config
 from rtd3jax.envs.registry import DISTURBANCES, ENVIRONMENTS
 from rtd3jax.errors import UserError
+from rtd3jax.registries import AGENTS
 from rtd3jax.study.command import add_import
 from rtd3jax.study.loggers import LOGGERS
 from rtd3jax.study.plan import Grid
@@ -46,7 +48,7 @@ def parser(description: str | None) -> argparse.ArgumentParser:
     )
     add_import(study)
     study.add_argument("--disturbances", nargs="+", metavar="ID", help="what is hidden [none]")
-    study.add_argument("--algorithms", nargs="+", metavar="ID", help=f"{', '.join(ALGORITHMS)}")
+    study.add_argument("--algorithms", nargs="+", metavar="ID", help=f"{', '.join(AGENTS)}")
     study.add_argument(
         "--history-lengths", nargs="+", type=int, metavar="L", help="past steps in a window [10]"
     )

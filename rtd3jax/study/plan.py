@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from rtd3jax.agents.variants import VARIANTS
+from rtd3jax.agents.agent import make_part
+from rtd3jax.agents.networks import Network
 from rtd3jax.config import Config
 from rtd3jax.envs.registry import make, parse_disturbance
 from rtd3jax.errors import UserError
+from rtd3jax.registries import AGENTS
 from rtd3jax.study.memory import job_bytes, lanes_at_once
 from rtd3jax.training.lanes import Job, workers
 from rtd3jax.training.run import make_jobs
@@ -103,12 +105,12 @@ def cell_jobs(cells: Sequence[Cell], seeds: Sequence[int], strategy: str) -> lis
     longest: dict[str, int] = {}
     if strategy == "vmap":
         for cell in cells:
-            longest[cell.env] = max(longest.get(cell.env, 0), cell.config.history_length or 0)
+            longest[cell.env] = max(longest.get(cell.env, 0), cell.config.tokens)
     return [
         job
         for cell in cells
         for job in make_jobs(
-            cell.make_env(), cell.config, seeds, cell=cell, window=longest.get(cell.env) or None
+            cell.make_env(), cell.config, seeds, cell=cell, window=longest.get(cell.env)
         )
     ]
 
@@ -153,30 +155,40 @@ def update_flops(config: Config) -> float:
     narrow products of the encoders and outputs are left out. tests/study/test_plan.py compares it
     with XLA's own count.
     """
-    variant, batch, width = VARIANTS[config.algorithm], config.batch_size, config.hidden_size
-    token = 2.0 * batch * 2 * width * 4 * width
+    variant, batch, width = AGENTS[config.algorithm], config.batch_size, config.hidden_size
     layer = 2.0 * batch * width * width
+    # Neither count depends on the narrow sizes of observations and actions.
+    actor, critic = (make_part(variant, role, config.memory, 1, 1, width) for role in _ROLES)
 
-    def head(spec: Any) -> float:
-        return layer * (1 + bool(spec.memory and spec.current))
+    def token(network: Network) -> tuple[float, float]:
+        of_input, of_carry = network.memory.operations() if network.memory else (0.0, 0.0)
+        return batch * of_input, batch * of_carry
 
-    def forward(spec: Any) -> float:
-        tokens = float(spec.memory_has_current)
-        if spec.memory and not spec.carry_from_replay:
-            # The first token's input product alone.
-            tokens += (config.history_length or 0) - 0.5
-        return tokens * token + head(spec)
+    def head(network: Network) -> float:
+        return layer * (1 + bool(network.reads.memory and network.reads.current))
 
-    def backward(spec: Any) -> float:
-        return 2 * forward(spec) - 0.5 * token * spec.carry_from_replay
+    def forward(network: Network) -> float:
+        of_input, of_carry = token(network)
+        reads = network.reads
+        tokens = int(reads.memory_has_current)
+        if reads.memory and not reads.carry_from_replay:
+            tokens += config.tokens
+            # The first token has no carry.
+            return tokens * (of_input + of_carry) - of_carry + head(network)
+        return tokens * (of_input + of_carry) + head(network)
 
-    actor, critic = variant.actor, variant.critic
+    def backward(network: Network) -> float:
+        return 2 * forward(network) - token(network)[1] * network.reads.carry_from_replay
+
     to_action = head(critic)
-    if critic.memory_has_current and "action" in critic.memory:
-        to_action += 0.5 * token
+    if critic.reads.memory_has_current and "action" in critic.reads.memory:
+        to_action += token(critic)[0]
     critics = forward(actor) + 2 * forward(critic) + 2 * (forward(critic) + backward(critic))
     delayed = forward(actor) + backward(actor) + forward(critic) + to_action
     return (critics + delayed / config.policy_delay) / config.update_every
+
+
+_ROLES = ("actor", "critic")
 
 
 def _matmul_rate(threads: int) -> float:

@@ -6,7 +6,7 @@ found these, on seeds that are not reported; docs/what_the_paper_leaves_open.md 
 
 from typing import Any
 
-from rtd3jax.config import ALGORITHMS
+from rtd3jax.agents.variants import ALGORITHMS
 from rtd3jax.study.plan import Grid
 
 ROVER_STEPS = 80_000

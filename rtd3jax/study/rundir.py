@@ -213,8 +213,9 @@ class RunDirectory:
             {n.removeprefix("actor."): a for n, a in arrays.items() if n.startswith("actor.")},
             describe(env, env.default_params),
             algorithm=cell.config.algorithm,
-            history_length=cell.config.history_length or 0,
+            history_length=cell.config.tokens,
             width=cell.config.hidden_size,
+            memory=cell.config.memory,
             format=about.get("format", 1),
         )
 

@@ -61,7 +61,7 @@ def transfer(
                     {
                         "env": cell.env,
                         "algorithm": cell.config.algorithm,
-                        "history_length": cell.config.history_length or 0,
+                        "history_length": cell.config.tokens,
                         "trained_on": cell.disturbance,
                         "tested_on": disturbance,
                         "seed": seed,

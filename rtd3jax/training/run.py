@@ -60,6 +60,8 @@ class Run:
             was lost.
         true_returns: the same of the undisturbed state's reward.
         failures: the lanes that were lost.
+        metrics: of learning, float32 [seeds, K] by name, averaged over the steps since the last
+            evaluation; NaN where nothing was measured. docs/run_a_study.md says what each is.
     """
 
     config: Config
@@ -68,6 +70,7 @@ class Run:
     returns: np.ndarray
     true_returns: np.ndarray
     failures: tuple[Failure, ...]
+    metrics: dict[str, np.ndarray]
     _policies: tuple[Policy | None, ...] = dataclasses.field(repr=False)
 
     def policy(self, seed: int) -> Policy:
@@ -165,13 +168,14 @@ def collect(config: Config, seeds: Sequence[int], groups: Iterable[Group]) -> Ru
             raise group.error
         found.update({job.owner[1]: (job, state) for job, state in group.lanes()})
     steps = evaluation_steps(config)
-    failures, policies, returns, true_returns = [], [], [], []
+    failures, policies, returns, true_returns, metrics = [], [], [], [], []
     for seed in seeds:
         job, state = found[seed]
         failure = failure_of(seed, state)
         curve, true_curve = curves_of(config, state, failure)
         returns.append(curve)
         true_returns.append(true_curve)
+        metrics.append(metric_curves(config, state, failure))
         policies.append(None if failure else job.program.policy(job.lane, state.learner.actor))
         failures += [failure] if failure else []
     return Run(
@@ -181,6 +185,7 @@ def collect(config: Config, seeds: Sequence[int], groups: Iterable[Group]) -> Ru
         np.stack(returns),
         np.stack(true_returns),
         tuple(failures),
+        {name: np.stack([lane[name] for lane in metrics]) for name in metrics[0]},
         tuple(policies),
     )
 
@@ -227,3 +232,12 @@ def curves_of(
         for curve in (state.returns, state.true_returns)
     )
     return returns, true_returns
+
+
+def metric_curves(
+    config: Config, state: LaneState, failure: Failure | None
+) -> dict[str, np.ndarray]:
+    """A lane's metrics of learning [K] by name; nothing after its loss counts."""
+    lost = evaluation_steps(config) > (np.inf if failure is None else failure.step)
+    curves = np.where(lost[:, None], np.float32(np.nan), np.asarray(state.metrics.curves))
+    return dict(zip(state.metrics.names, curves.T, strict=True))

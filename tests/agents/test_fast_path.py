@@ -4,15 +4,18 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from rtd3jax.agents import lstm as fast
-from rtd3jax.agents import networks, td3
-from rtd3jax.agents.networks import apply_network
+from rtd3jax.agents.agent import make_part
+from rtd3jax.agents.history import Steps, Window
+from rtd3jax.agents.hyperparameters import Hyperparameters
+from rtd3jax.agents.learners import td3
+from rtd3jax.agents.learners.base import Networks
+from rtd3jax.agents.memory import lstm as fast
+from rtd3jax.agents.networks import act, apply_network
 from rtd3jax.agents.replay import Batch
-from rtd3jax.agents.variants import VARIANTS
-from rtd3jax.agents.windows import Steps, Window
+from rtd3jax.registries import AGENTS
 
 B, L, WIDTH, UPDATES = 8, 3, 8, 200
-NUMBERS = td3.Hyperparameters(
+NUMBERS = Hyperparameters(
     *(jnp.float32(x) for x in (1e-3, 1e-3, 1.0, 0.9, 1.0, 0.005, 0.1, 0.2, 0.5, 0.0)),
     history_length=jnp.int32(L),
 )
@@ -39,17 +42,17 @@ def _batch(key):
     )
 
 
-def _straightforward(learner, variant, batch, key):
+def _straightforward(learner, networks, batch, key):
     """One step of TD3 as one writes it down: joint losses, automatic differentiation, optax."""
-    y = td3.target(learner, variant, batch, key, NUMBERS)
+    y = td3.target(networks, learner, batch, key, NUMBERS)
 
     def critics_loss(critics):
-        values = [apply_network(c, variant.critic, batch.window, batch.action) for c in critics]
+        values = [apply_network(networks.critic, c, batch.window, batch.action) for c in critics]
         return sum(jnp.mean((value[:, 0] - y) ** 2) for value in values)
 
     def actor_loss(actor):
-        action = td3.act(actor, variant, batch.window)
-        return -jnp.mean(apply_network(critics[0], variant.critic, batch.window, action))
+        action = act(networks.actor, actor, batch.window)
+        return -jnp.mean(apply_network(networks.critic, critics[0], batch.window, action))
 
     adam = optax.scale_by_adam()
 
@@ -67,7 +70,7 @@ def _straightforward(learner, variant, batch, key):
     actor, actor_state = descend(
         learner.actor, jax.grad(actor_loss)(learner.actor), learner.actor_optimizer
     )
-    return td3.Learner(
+    return td3.TD3State(
         actor=actor,
         critics=critics,
         target_actor=average(actor, learner.target_actor),
@@ -77,9 +80,9 @@ def _straightforward(learner, variant, batch, key):
     )
 
 
-def _fast(learner, variant, batch, key):
-    learner, _ = td3.update_critics(learner, variant, batch, key, NUMBERS)
-    return td3.update_actor_and_targets(learner, variant, batch, key, NUMBERS)
+def _fast(learner, networks, batch, key):
+    keys, count = jnp.stack((key, key)), jnp.int32(1)
+    return td3.TD3(policy_delay=1).update(networks, learner, batch, keys, NUMBERS, count)[0]
 
 
 def _reference_lstm(params, inputs, exists, carry=None, precision="float32"):
@@ -87,19 +90,20 @@ def _reference_lstm(params, inputs, exists, carry=None, precision="float32"):
 
 
 def test_200_updates_agree_to_float32_rounding(monkeypatch):
-    variant = VARIANTS["lstm-td3-1ha1hc"]
+    agent = AGENTS["lstm-td3-1ha1hc"]
+    networks = Networks(*(make_part(agent, r, "lstm", 3, 1, WIDTH) for r in ("actor", "critic")))
 
     def train(update):
         def step(learner, key):
             batch_key, noise_key = jax.random.split(key)
-            return update(learner, variant, _batch(batch_key), noise_key), None
+            return update(learner, networks, _batch(batch_key), noise_key), None
 
-        learner = td3.init_learner(jax.random.key(0), variant, 3, 1, WIDTH)
+        learner = td3.TD3().init(jax.random.key(0), networks)
         keys = jax.random.split(jax.random.key(1), UPDATES)
         return jax.jit(lambda first: jax.lax.scan(step, first, keys)[0])(learner), learner
 
     quick, start = train(_fast)
-    monkeypatch.setattr(networks, "lstm", _reference_lstm)
+    monkeypatch.setattr(fast, "lstm", _reference_lstm)
     slow, _ = train(_straightforward)
 
     def farthest(one, other):

@@ -5,7 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rtd3jax.agents.lstm import Carry, init_lstm, lstm, reference, zero_carry
+from rtd3jax.agents.memory.lstm import (
+    Carry,
+    init_lstm,
+    lstm,
+    reference,
+    zero_carry,
+)
 
 TOKENS, BATCH, INPUTS, WIDTH = 5, 4, 3, 6
 

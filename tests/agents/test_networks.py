@@ -5,17 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rtd3jax.agents.networks import (
-    apply_network,
-    carry_before,
-    count_parameters,
-    init_network,
-    part_sizes,
-)
-from rtd3jax.agents.variants import VARIANTS
-from rtd3jax.agents.windows import Steps, Window
-from rtd3jax.config import ALGORITHMS
+from rtd3jax.agents.agent import count_parameters, make_part
+from rtd3jax.agents.history import Steps, Window
+from rtd3jax.agents.networks import apply_network, carry_before, init_network
+from rtd3jax.agents.variants import ALGORITHMS
 from rtd3jax.errors import UserError
+from rtd3jax.registries import AGENTS
 
 L, B, O, A, H = 3, 5, 3, 2, 8  # noqa: E741
 
@@ -83,7 +78,7 @@ def _np_network(p, name, role, w, b, action, stored):
     cat, zero = np.concatenate, np.zeros(H, np.float32)
 
     def memory(tokens, start=(zero, zero)):
-        return _np_lstm(p["lstm"], [relu(linear(p["encoder"], x)) for x in tokens], *start)[0]
+        return _np_lstm(p["memory"], [relu(linear(p["encoder"], x)) for x in tokens], *start)[0]
 
     oa = [cat([obs[k, b], act[k, b]]) for k in past]
     op = [cat([obs[k, b], prev[k, b]]) for k in past] + [cat([now_o, now_p])]
@@ -118,27 +113,26 @@ def _np_network(p, name, role, w, b, action, stored):
 @pytest.mark.parametrize("role", ["actor", "critic"])
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_forward_pass_equals_numpy(algorithm, role):
-    variant = VARIANTS[algorithm]
-    spec = getattr(variant, role)
-    params = init_network(jax.random.key(1), spec, part_sizes(O, A), H, 2)
+    network = make_part(AGENTS[algorithm], role, "lstm", O, A, H)
+    params = init_network(jax.random.key(1), network)
     window = _window(jax.random.key(2), [0, 1, 2, 3, 3])
     action = jax.random.normal(jax.random.key(3), (B, A))
     stored = None
-    if spec.carry_from_replay:
-        actor = init_network(jax.random.key(4), variant.actor, part_sizes(O, A), H, A)
-        stored = carry_before(actor, variant.actor, window)
-    ours = apply_network(params, spec, window, action, stored)
+    if network.reads.carry_from_replay:
+        actor = make_part(AGENTS[algorithm], "actor", "lstm", O, A, H)
+        stored = carry_before(actor, init_network(jax.random.key(4), actor), window)
+    ours = apply_network(network, params, window, action, stored)
     numpy = jax.tree.map(np.asarray, (params, window, action, stored))
     theirs = [_np_network(numpy[0], algorithm, role, numpy[1], b, *numpy[2:]) for b in range(B)]
     np.testing.assert_allclose(ours, np.stack(theirs), atol=1e-5)
 
 
 def test_initial_weights_are_uniform_in_the_stated_bounds():
-    spec = VARIANTS["lstm-td3-1ha1hc"].actor
-    params = init_network(jax.random.key(0), spec, part_sizes(3, 1), 128, 1)
+    network = make_part(AGENTS["lstm-td3-1ha1hc"], "actor", "lstm", 3, 1, 128)
+    params = init_network(jax.random.key(0), network)
     for name, fan_in in (("encoder", 4), ("head", 128), ("output", 128)):
         kernel = np.asarray(params[name]["kernel"]) * fan_in**0.5
         assert np.abs(kernel).max() <= 1 and abs(kernel).mean() == pytest.approx(0.5, abs=0.07)
-    for leaf in params["lstm"].values():
+    for leaf in params["memory"].values():
         scaled = np.abs(leaf) * 128**0.5
         assert scaled.max() <= 1 and scaled.mean() == pytest.approx(0.5, abs=0.03)

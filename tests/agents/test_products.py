@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rtd3jax.agents.lstm import Carry, init_lstm, lstm, reference
+from rtd3jax.agents.memory.lstm import Carry, init_lstm, lstm, reference
 from rtd3jax.agents.products import matmul, weight_gradient
 
 

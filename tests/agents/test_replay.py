@@ -6,7 +6,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtd3jax.agents.lstm import Carry
+from rtd3jax.agents.history import Steps
+from rtd3jax.agents.memory.lstm import Carry, zero_carry
 from rtd3jax.agents.replay import (
     Transition,
     empty_replay,
@@ -15,7 +16,6 @@ from rtd3jax.agents.replay import (
     put_transition,
     sample,
 )
-from rtd3jax.agents.windows import Steps
 
 
 def _history(lengths):
@@ -40,7 +40,7 @@ def _history(lengths):
 
 def _store(rows, capacity):
     """Write the rows, and carries as the loop does: before each step; after each end."""
-    replay = empty_replay(capacity, 2, 1, carry_width=1)
+    replay = empty_replay(capacity, 2, 1, zero_carry(1, 1))
     for number, row in enumerate(rows):
         if row["age"]:
             replay = put_carry(replay, jnp.int32(number), _carry(row["observation"]))

@@ -6,11 +6,16 @@ import numpy as np
 import optax
 import pytest
 
-from rtd3jax.agents import td3
-from rtd3jax.agents.networks import apply_network
+from rtd3jax.agents.agent import make_part
+from rtd3jax.agents.bounds import Bounds
+from rtd3jax.agents.history import Steps, Window
+from rtd3jax.agents.hyperparameters import Hyperparameters
+from rtd3jax.agents.learners import td3
+from rtd3jax.agents.learners.base import Networks
+from rtd3jax.agents.networks import act, apply_network
+from rtd3jax.agents.noise import add_noise
 from rtd3jax.agents.replay import Batch
-from rtd3jax.agents.variants import VARIANTS
-from rtd3jax.agents.windows import Steps, Window
+from rtd3jax.registries import AGENTS
 
 B, L, WIDTH = 6, 2, 16
 
@@ -29,7 +34,7 @@ def _numbers(**changes):
         actor_noise=0.0,
     )
     values = {name: jnp.float32(value) for name, value in (numbers | changes).items()}
-    return td3.Hyperparameters(**values, history_length=jnp.int32(L))
+    return Hyperparameters(**values, history_length=jnp.int32(L))
 
 
 def _window(key):
@@ -58,67 +63,68 @@ def _batch():
 
 @pytest.fixture(params=["td3", "lstm-td3-1ha1hc", "lstm-td3"])
 def problem(request):
-    variant = VARIANTS[request.param]
-    learner = td3.init_learner(jax.random.key(0), variant, 3, 1, WIDTH)
-    other = td3.init_learner(jax.random.key(1), variant, 3, 1, WIDTH)
+    parts = (make_part(AGENTS[request.param], r, "lstm", 3, 1, WIDTH) for r in ("actor", "critic"))
+    networks = Networks(*parts)
+    learner = td3.TD3().init(jax.random.key(0), networks)
+    other = td3.TD3().init(jax.random.key(1), networks)
     learner = learner.replace(
         target_actor=other.actor, target_critics=other.critics
     )  # so that targets and online networks cannot be taken for one another
-    return variant, learner, _batch()
+    return networks, learner, _batch()
 
 
 def test_target_is_the_formula(problem):
-    variant, learner, batch = problem
-    got = td3.target(learner, variant, batch, jax.random.key(9), _numbers())
+    networks, learner, batch = problem
+    got = td3.target(networks, learner, batch, jax.random.key(9), _numbers())
     noise = np.clip(0.2 * np.asarray(jax.random.normal(jax.random.key(9), (B, 1))), -0.3, 0.3)
-    output = apply_network(learner.target_actor, variant.actor, batch.next_window)
+    output = apply_network(networks.actor, learner.target_actor, batch.next_window)
     action = np.clip(np.tanh(np.asarray(output)) + noise, -1.0, 1.0)
     values = [
-        np.asarray(apply_network(critic, variant.critic, batch.next_window, jnp.asarray(action)))
+        np.asarray(apply_network(networks.critic, critic, batch.next_window, jnp.asarray(action)))
         for critic in learner.target_critics
     ]
     assert not np.allclose(*values)
-    scaled = td3.target(learner, variant, batch, jax.random.key(9), _numbers(reward_scale=5))
+    scaled = td3.target(networks, learner, batch, jax.random.key(9), _numbers(reward_scale=5))
     np.testing.assert_allclose(scaled - got, 4 * np.asarray(batch.reward), rtol=1e-4, atol=1e-5)
     bootstrap = 0.9 * np.minimum(*values)[:, 0] * ~np.asarray(batch.terminated)
     np.testing.assert_allclose(got, np.asarray(batch.reward) + bootstrap, rtol=1e-5, atol=1e-6)
 
 
 def test_target_noise_is_clipped(problem):
-    variant, learner, batch = problem
-    wide = td3.target(learner, variant, batch, jax.random.key(1), _numbers(target_noise=99))
+    networks, learner, batch = problem
+    wide = td3.target(networks, learner, batch, jax.random.key(1), _numbers(target_noise=99))
     still = td3.target(
+        networks,
         learner,
-        variant,
         batch,
         jax.random.key(1),
         _numbers(target_noise=99, target_noise_clip=0),
     )
-    none = td3.target(learner, variant, batch, jax.random.key(1), _numbers(target_noise=0))
+    none = td3.target(networks, learner, batch, jax.random.key(1), _numbers(target_noise=0))
     np.testing.assert_allclose(still, none, rtol=1e-6)
     assert not np.allclose(wide, none)
 
 
 def test_the_loss_of_a_critic_is_its_mean_squared_error(problem):
-    variant, learner, batch = problem
+    networks, learner, batch = problem
     y = jnp.linspace(-1.0, 1.0, B)
     for critic in learner.critics:
-        value = apply_network(critic, variant.critic, batch.window, batch.action)[:, 0]
-        got = td3.critic_loss(critic, variant, batch, y)
+        value = apply_network(networks.critic, critic, batch.window, batch.action)[:, 0]
+        got = td3.critic_loss(critic, networks.critic, batch, y)[0]
         np.testing.assert_allclose(got, np.mean((value - y) ** 2), rtol=1e-5)
 
 
 def test_the_actor_climbs_the_first_critic(problem):
-    variant, learner, batch = problem
+    networks, learner, batch = problem
 
     def loss(actor):
-        action = jnp.tanh(apply_network(actor, variant.actor, batch.window))
-        return -jnp.mean(apply_network(learner.critics[0], variant.critic, batch.window, action))
+        action = jnp.tanh(apply_network(networks.actor, actor, batch.window))
+        return -jnp.mean(apply_network(networks.critic, learner.critics[0], batch.window, action))
 
-    value, gradient = jax.value_and_grad(td3.actor_loss)(
+    (value, saturated), gradient = jax.value_and_grad(td3.actor_loss, has_aux=True)(
         learner.actor,
         learner.critics[0],
-        variant,
+        networks,
         batch,
         jax.random.key(3),
         jnp.float32(0.0),
@@ -131,21 +137,21 @@ def test_the_actor_climbs_the_first_critic(problem):
 
 
 def test_actor_noise_averages_the_value_over_the_actions_around(problem):
-    variant, learner, batch = problem
+    networks, learner, batch = problem
     noise, draws = 0.3, 4_000
-    greedy = np.asarray(td3.act(learner.actor, variant, batch.window))
+    greedy = np.asarray(act(networks.actor, learner.actor, batch.window))
     around = np.random.default_rng(0).normal(size=(draws, B, 1)) * noise
     actions = jnp.asarray(np.clip(greedy[None] + around, -1.0, 1.0), jnp.float32)
 
     def value(action):
-        return apply_network(learner.critics[0], variant.critic, batch.window, action)[:, 0]
+        return apply_network(networks.critic, learner.critics[0], batch.window, action)[:, 0]
 
     expected = -np.asarray(jax.vmap(value)(actions)).mean()
     keys = jax.random.split(jax.random.key(3), draws)
     got = jax.vmap(
         lambda key: td3.actor_loss(
-            learner.actor, learner.critics[0], variant, batch, key, jnp.float32(noise)
-        )
+            learner.actor, learner.critics[0], networks, batch, key, jnp.float32(noise)
+        )[0]
     )(keys)
     error = float(got.std()) / np.sqrt(draws)
     assert abs(float(got.mean()) - expected) < 6 * error
@@ -153,13 +159,15 @@ def test_actor_noise_averages_the_value_over_the_actions_around(problem):
 
 
 def test_updates_are_adam_and_polyak(problem):
-    variant, learner, batch = problem
-    y = td3.target(learner, variant, batch, jax.random.key(2), _numbers())
+    networks, learner, batch = problem
+    y = td3.target(networks, learner, batch, jax.random.key(2), _numbers())
 
     def both(critics):
-        return sum(td3.critic_loss(critic, variant, batch, y) for critic in critics)
+        return sum(td3.critic_loss(critic, networks.critic, batch, y)[0] for critic in critics)
 
-    updated, loss = td3.update_critics(learner, variant, batch, jax.random.key(2), _numbers())
+    updated, metrics = td3.update_critics(
+        networks, learner, batch, jax.random.key(2), _numbers(), jnp.asarray(True)
+    )
     with jax.numpy_dtype_promotion("standard"):
         adam = optax.adam(2e-2)
         gradient = jax.grad(both)(learner.critics)
@@ -171,9 +179,13 @@ def test_updates_are_adam_and_polyak(problem):
         assert clear.mean() > 0.5
         np.testing.assert_allclose(np.asarray(a)[clear], np.asarray(b)[clear], atol=1e-6)
     assert updated.actor is learner.actor and updated.target_critics is learner.target_critics
-    assert float(loss) == pytest.approx(float(both(learner.critics)), rel=1e-6)
+    assert float(metrics["critic_loss"].total) == pytest.approx(
+        float(both(learner.critics)), rel=1e-6
+    )
 
-    after = td3.update_actor_and_targets(updated, variant, batch, jax.random.key(3), _numbers())
+    after, actor_metrics = td3.update_actor_and_targets(
+        networks, updated, batch, jax.random.key(3), _numbers(), jnp.asarray(True)
+    )
     triples = (
         (after.actor, learner.target_actor, after.target_actor),
         (updated.critics, learner.target_critics, after.target_critics),
@@ -186,15 +198,15 @@ def test_updates_are_adam_and_polyak(problem):
 
 def test_noise_has_its_scale_and_actions_stay_within():
     action = jnp.zeros((20_000, 1))
-    noisy = td3.add_noise(jax.random.key(0), action, jnp.float32(0.1))
+    noisy = add_noise(jax.random.key(0), action, jnp.float32(0.1))
     assert float(jnp.std(noisy)) == pytest.approx(0.1, rel=0.02)
-    wild = td3.add_noise(jax.random.key(0), action, jnp.float32(10.0))
+    wild = add_noise(jax.random.key(0), action, jnp.float32(10.0))
     assert float(wild.min()) == -1.0 and float(wild.max()) == 1.0
 
 
 def test_actions_in_the_environments_units_are_within_its_bounds():
     low, high = jnp.array([-2.0, 0.1, 1e-3, -3e38]), jnp.array([4.0, 0.7, 3e-3, 3e38])
-    bounds = td3.Bounds(low, high)
+    bounds = Bounds(low, high)
     for action, expected in ((-1.0, low), (1.0, high), (0.0, [1.0, 0.4, 2e-3, 0.0])):
         got = bounds.to_environment(jnp.full((4,), action))
         np.testing.assert_allclose(got, expected, rtol=1e-6)
@@ -211,11 +223,16 @@ def test_learning_rates_fall_linearly_to_their_final_fraction():
 
 
 def test_actor_noise_reaches_the_actor_alone(problem):
-    variant, learner, batch = problem
+    networks, learner, batch = problem
     still, smoothed, again = (
         td3.update_actor_and_targets(
-            learner, variant, batch, jax.random.key(3), _numbers(actor_noise=noise)
-        )
+            networks,
+            learner,
+            batch,
+            jax.random.key(3),
+            _numbers(actor_noise=noise),
+            jnp.asarray(False),
+        )[0]
         for noise in (0.0, 0.5, 0.5)
     )
     kernels = [after.actor["head"]["kernel"] for after in (still, smoothed, again)]

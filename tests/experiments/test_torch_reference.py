@@ -7,11 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rtd3jax.agents import td3
-from rtd3jax.agents.lstm import Carry
+from rtd3jax.agents.agent import make_part
+from rtd3jax.agents.history import Steps
+from rtd3jax.agents.hyperparameters import Hyperparameters
+from rtd3jax.agents.learners import td3
+from rtd3jax.agents.learners.base import Networks
+from rtd3jax.agents.memory.lstm import Carry, zero_carry
 from rtd3jax.agents.replay import Transition, empty_replay, gather, put_carry, put_transition
-from rtd3jax.agents.variants import VARIANTS
-from rtd3jax.agents.windows import Steps
+from rtd3jax.agents.variants import ALGORITHMS
+from rtd3jax.registries import AGENTS
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: pip install '.[bench]'")
 
@@ -37,7 +41,10 @@ HYPERPARAMETERS = dict(
 @pytest.fixture(scope="module")
 def replays():
     """Both replays after the same steps, the ring having wrapped; episodes of 10 steps."""
-    ours, theirs = empty_replay(CAPACITY, OBS, A, WIDTH), Ring(CAPACITY, OBS, A, WIDTH)
+    ours, theirs = (
+        empty_replay(CAPACITY, OBS, A, zero_carry(1, WIDTH)),
+        Ring(CAPACITY, OBS, A, WIDTH),
+    )
     random = np.random.default_rng(0)
     for number in range(STEPS):
         observation, after = random.standard_normal((2, OBS)).astype(np.float32)
@@ -116,7 +123,7 @@ def _load(network, params, spec):
     with torch.no_grad():
         if spec.memory:
             linear(network.encoder, params["encoder"], spec.memory)
-            lstm = {name: torch.tensor(np.asarray(leaf)) for name, leaf in params["lstm"].items()}
+            lstm = {name: torch.tensor(np.asarray(leaf)) for name, leaf in params["memory"].items()}
             network.lstm.weight_ih_l0[:, :WIDTH] = lstm["input_kernel"].T
             network.lstm.weight_hh_l0.copy_(lstm["recurrent_kernel"].T)
             network.lstm.bias_ih_l0.copy_(lstm["input_bias"])
@@ -158,7 +165,7 @@ def _assert_same(theirs, learner, variant):
 def _learner(variant):
     """A learner all of whose networks differ; drawn by numpy, which compiles nothing."""
     random = np.random.default_rng(3)
-    shapes = jax.eval_shape(lambda: td3.init_learner(jax.random.key(0), variant, OBS, A, WIDTH))
+    shapes = jax.eval_shape(lambda: td3.TD3().init(jax.random.key(0), _modules(variant)))
     zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
     networks = {
         name: jax.tree.map(
@@ -170,22 +177,27 @@ def _learner(variant):
     return zeros.replace(**networks)
 
 
+def _modules(variant):
+    return Networks(*(make_part(variant, r, "lstm", OBS, A, WIDTH) for r in ("actor", "critic")))
+
+
 @functools.partial(jax.jit, static_argnums=0)
 def _update(variant, before, batch):
     """Our target, loss and learner after one update, and the noise that it drew."""
     numbers = {k: jnp.float32(v) for k, v in HYPERPARAMETERS.items()}
-    numbers = td3.Hyperparameters(**numbers, history_length=jnp.int32(LENGTH))
+    numbers = Hyperparameters(**numbers, history_length=jnp.int32(LENGTH))
     key = jax.random.key(5)
     gaussian = jax.random.normal(key, (len(NUMBERS), A), jnp.float32)
-    y = td3.target(before, variant, batch, key, numbers)
-    after, loss = td3.update_critics(before, variant, batch, key, numbers)
-    after = td3.update_actor_and_targets(after, variant, batch, key, numbers)
-    return y, loss, after, gaussian
+    networks = _modules(variant)
+    y = td3.target(networks, before, batch, key, numbers)
+    learner, keys = td3.TD3(policy_delay=1), jnp.stack((key, key))
+    after, metrics = learner.update(networks, before, batch, keys, numbers, jnp.int32(1))
+    return y, metrics["critic_loss"].total, after, gaussian
 
 
-@pytest.mark.parametrize("name", VARIANTS)
+@pytest.mark.parametrize("name", ALGORITHMS)
 def test_an_update_is_the_same(batches, name):
-    variant = VARIANTS[name]
+    variant = AGENTS[name]
     batch, other_batch = batches
     other_batch = tensors(other_batch)
     if not variant.stores_carry:

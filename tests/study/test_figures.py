@@ -4,7 +4,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from rtd3jax.agents.variants import ALGORITHMS
 from rtd3jax.study import figures
+from rtd3jax.study.colours import colour_of
 from rtd3jax.study.statistics import summarise
 
 
@@ -134,7 +136,9 @@ def test_each_panel_shows_its_own_history_length(tmp_path, drawn):
 
 
 def test_each_algorithm_has_its_own_colour():
-    assert len(set(figures.COLOURS.values()) | {figures.OTHER_COLOUR}) == 7
+    agents = (*ALGORITHMS, "another")
+    for on_dark in (False, True):
+        assert len({colour_of(name, on_dark=on_dark) for name in agents}) == 7
 
 
 def test_references_are_lines_at_their_mean_return(tmp_path, drawn):

@@ -7,10 +7,15 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from rtd3jax.agents import lstm, td3
+from rtd3jax.agents.agent import make_part
+from rtd3jax.agents.hyperparameters import Hyperparameters
+from rtd3jax.agents.learners import td3
+from rtd3jax.agents.learners.base import Networks
+from rtd3jax.agents.memory import lstm
 from rtd3jax.agents.replay import empty_replay, gather
-from rtd3jax.agents.variants import VARIANTS
+from rtd3jax.agents.variants import ALGORITHMS
 from rtd3jax.config import Config
+from rtd3jax.registries import AGENTS
 from rtd3jax.study.plan import Grid, cell_jobs, make_cells, update_flops
 from rtd3jax.study.rundir import _whose
 
@@ -31,25 +36,29 @@ def _mapped(f, xs):
 
 def _counted(algorithm, length, width, batch_size):
     """XLA's count for a step's updates: products of any size, and elementwise operations."""
-    variant = VARIANTS[algorithm]
-    numbers = {f.name: jnp.float32(0.1) for f in dataclasses.fields(td3.Hyperparameters)}
-    numbers = td3.Hyperparameters(**numbers | {"history_length": jnp.int32(length)})
+    variant = AGENTS[algorithm]
+    networks = Networks(*(make_part(variant, r, "lstm", 2, 2, width) for r in ("actor", "critic")))
+    numbers = {f.name: jnp.float32(0.1) for f in dataclasses.fields(Hyperparameters)}
+    numbers = Hyperparameters(**numbers | {"history_length": jnp.int32(length)})
 
     def inputs():
-        replay = empty_replay(200, 2, 2, width if variant.stores_carry else None)
+        carry = lstm.zero_carry(1, width) if variant.stores_carry else None
+        replay = empty_replay(200, 2, 2, carry)
         rows = jnp.zeros((batch_size,), jnp.int32)
         return (
-            td3.init_learner(jax.random.key(0), variant, 2, 2, width),
+            td3.TD3().init(jax.random.key(0), networks),
             gather(replay, rows, jnp.int32(5), length, length),
         )
 
     def critics(learner, batch):
         key = jax.random.key(0)
-        return td3.update_critics(learner, variant, batch, key, numbers)
+        return td3.update_critics(networks, learner, batch, key, numbers, jnp.asarray(False))
 
     def actor(learner, batch):
         key = jax.random.key(0)
-        return td3.update_actor_and_targets(learner, variant, batch, key, numbers)
+        return td3.update_actor_and_targets(
+            networks, learner, batch, key, numbers, jnp.asarray(False)
+        )
 
     count = [
         jax.jit(update).lower(*jax.eval_shape(inputs)).cost_analysis()["flops"]
@@ -58,7 +67,7 @@ def _counted(algorithm, length, width, batch_size):
     return count[0] + count[1] / Config.policy_delay
 
 
-@pytest.mark.parametrize("algorithm", VARIANTS)
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_operations_are_those_that_xla_counts(algorithm, monkeypatch):
     monkeypatch.setattr(lstm, "lax", types.SimpleNamespace(**{**vars(jax.lax), "scan": _unrolled}))
     monkeypatch.setattr(td3, "lax", types.SimpleNamespace(**{**vars(jax.lax), "map": _mapped}))

@@ -11,7 +11,6 @@ from gymnax.environments import environment, spaces
 
 from rtd3jax.agents.networks import carry_before
 from rtd3jax.agents.replay import gather
-from rtd3jax.agents.variants import VARIANTS
 from rtd3jax.config import Config
 from rtd3jax.training.loop import make_lane, make_program
 
@@ -101,13 +100,13 @@ def test_only_terminations_are_marked_terminated(rows):
 
 
 def test_stored_carries_are_the_actors_own(lane):
-    _, _, state = lane
+    program, _, state = lane
     # The newest row's next carry is known only once the agent has acted again.
     numbers = jnp.arange(STEPS - 1, dtype=jnp.int32)
     batch = gather(state.replay, numbers, jnp.int32(STEPS), 3, 3)
-    actor, spec = state.learner.actor, VARIANTS["h-td3"].actor
+    actor, network = state.learner.actor, program.agent.acting
     for stored, window in ((batch.carry, batch.window), (batch.next_carry, batch.next_window)):
-        for got, want in zip(stored, carry_before(actor, spec, window), strict=True):
+        for got, want in zip(stored, carry_before(network, actor, window), strict=True):
             np.testing.assert_allclose(got, want, atol=1e-6)
 
 

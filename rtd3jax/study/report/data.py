@@ -16,7 +16,7 @@ import pandas as pd
 
 from rtd3jax.config import Config
 from rtd3jax.errors import UserError
-from rtd3jax.study.figures import colour_of, ordered
+from rtd3jax.study.colours import colour_of, ordered
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.results import CELL, CURVES, EPISODES, REFERENCES, number, read_table
 from rtd3jax.study.rundir import LOG, RunDirectory, lane_of, read_log, steps_reached
@@ -24,9 +24,6 @@ from rtd3jax.study.statistics import Summary, iqm_bands, summarise
 
 MOST_POINTS = 200
 """Points of a learning curve that are drawn; of a longer one, as many, evenly spaced."""
-
-ON_DARK = {"td3": "#F2F2F2", "lstm-td3": "#3D9BE0"}
-"""Colours of `rtd3jax.study.figures` that a dark page would swallow, made lighter."""
 
 MEASURES = {"return": "as rewarded", "true_return": "of the true state"}
 
@@ -67,7 +64,7 @@ def study_data(
             {
                 "name": name,
                 "colour": colour_of(name),
-                "dark": ON_DARK.get(name, colour_of(name)),
+                "dark": colour_of(name, on_dark=True),
             }
             for name in algorithms
         ],

@@ -57,7 +57,7 @@ def recordings(
     ``record``, only those that are kept.
     """
     count = EPISODES if len(directory.cells) <= MOST_CELLS else 1
-    longest = max(cell.config.history_length or 0 for cell in directory.cells)
+    longest = max(cell.config.tokens for cell in directory.cells)
     found: list[dict[str, Any]] = []
     problems: dict[str, list[str]] = {}
     for index, cell in enumerate(directory.cells):

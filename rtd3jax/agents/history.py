@@ -1,6 +1,6 @@
-"""Windows: the tokens that an agent may read, cut from a ring of steps (spec section 1).
+"""Histories: the tokens that an agent may read, cut from a ring of steps (paper, Section 4).
 
-One function, `past_tokens`, serves acting, replay, evaluation and deployment. Its invariant: the
+One function, `window_at`, serves acting, replay, evaluation and deployment. Its invariant: the
 tokens that exist are the last of the window. What is before an episode's first step, before the
 oldest step kept, or beyond the history length does not exist; it is not a zero token.
 
@@ -71,28 +71,35 @@ def put_step(ring: Steps, number: jax.Array, step: Steps) -> Steps:
     return jax.tree.map(lambda kept, row: put_row(kept, slot, row), ring, step)
 
 
-def past_tokens(
-    ring: Steps, number: jax.Array, age: jax.Array, count: jax.Array, tokens: int
-) -> tuple[Steps, jax.Array]:
-    """The ``tokens`` steps before step ``number``, and how many of them may be read.
+def window_at(
+    ring: Steps,
+    number: jax.Array,
+    age: jax.Array,
+    count: jax.Array,
+    tokens: int,
+    history_length: jax.Array | int,
+    observation: jax.Array,
+    previous_action: jax.Array,
+) -> Window:
+    """What may be read at step ``number``.
 
     Args:
         ring: the steps.
-        number: int32 [B], the step whose past is asked for; at most ``count``.
+        number: int32 [B], at most ``count``.
         age: int32 [B], steps of the same episode before it.
         count: int32 [], steps ever written; the ring holds the last C of them.
-        tokens: L.
-
-    Returns:
-        Steps with leaves [L, B, ...], and int32 [B]: min(age, L, steps still in the ring).
+        tokens: L, past tokens in the window's arrays.
+        history_length: l <= L, past tokens that may be read.
+        observation: [B, O], of the step.
+        previous_action: [B, A], before it.
     """
     capacity = ring.action.shape[0]
     offset = jnp.arange(tokens, 0, -1, dtype=jnp.int32)
     slots = (number[None, :] - offset[:, None]) % capacity
     past = jax.tree.map(lambda kept: kept[slots], ring)
     oldest = jnp.maximum(count - capacity, 0)
-    length = jnp.minimum(jnp.minimum(age, number - oldest), tokens)
-    return past, length.astype(jnp.int32)
+    length = _limited(jnp.minimum(age, number - oldest), tokens, history_length)
+    return Window(past, length, observation, previous_action)
 
 
 def next_window(
@@ -113,5 +120,10 @@ def next_window(
         window.past,
         current,
     )
-    length = jnp.minimum(jnp.minimum(window.length + 1, tokens), history_length)
-    return Window(past, length.astype(jnp.int32), next_observation, action)
+    length = _limited(window.length + 1, tokens, history_length)
+    return Window(past, length, next_observation, action)
+
+
+def _limited(length: jax.Array, tokens: int, history_length: jax.Array | int) -> jax.Array:
+    """``length`` int32 [B], as far as the window's arrays and the agent's own length allow."""
+    return jnp.minimum(jnp.minimum(length, tokens), history_length).astype(jnp.int32)

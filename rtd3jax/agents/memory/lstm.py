@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from rtd3jax.agents.memory.base import Memory
 from rtd3jax.agents.products import matmul, narrow, product, weight_gradient
 
 Params = dict[str, jax.Array]
@@ -43,10 +44,54 @@ def init_lstm(key: jax.Array, inputs: int, width: int) -> Params:
     }
 
 
+_ARRAYS = ("input_kernel", "recurrent_kernel", "input_bias", "recurrent_bias")
+
+
 def zero_carry(batch: int, width: int) -> Carry:
     """The carry before any token."""
     zeros = jnp.zeros((batch, width), jnp.float32)
     return Carry(zeros, zeros)
+
+
+class LSTM(Memory):
+    """The LSTM as a memory: two bias vectors, gates in the order i, f, g, o."""
+
+    def setup(self) -> None:
+        # Named as in files; `initial` draws all of them from one key.
+        self.kernels = {
+            name: self.param(name, lambda key, name=name: self.initial(key)[name])
+            for name in _ARRAYS
+        }
+
+    def initial(self, key: jax.Array) -> Params:
+        """Uniform in ±1/sqrt(H)."""
+        return init_lstm(key, self.inputs, self.width)
+
+    def zero(self, batch: int) -> Carry:
+        """Zeros [B, H]."""
+        return zero_carry(batch, self.width)
+
+    def step(self, carry: Carry, token: jax.Array) -> Carry:
+        """One token [B, I], without the hand-written gradient: for policies that act."""
+        present = jnp.ones((1, token.shape[0]), bool)
+        return lstm(self.kernels, token[None], present, carry, self.precision)
+
+    def read(self, carry: Carry) -> jax.Array:
+        """The hidden state [B, H]."""
+        return carry.hidden
+
+    def carries(self, carry: Carry | None, tokens: jax.Array, starts: jax.Array) -> Carry:
+        """The carries after each token: [T, B, H]."""
+        start = zero_carry(tokens.shape[1], self.width) if carry is None else carry
+        return lstm_carries(self.kernels, tokens, starts, start, self.precision)
+
+    def end(self, carry: Carry | None, tokens: jax.Array, exists: jax.Array) -> Carry:
+        """The carry after all tokens."""
+        return lstm(self.kernels, tokens, exists, carry, self.precision)
+
+    def operations(self) -> tuple[float, float]:
+        """Of the input's product and of the hidden state's."""
+        return 8.0 * self.inputs * self.width, 8.0 * self.width * self.width
 
 
 def lstm(
@@ -78,6 +123,27 @@ def lstm(
     if inputs.shape[0] == 0:
         return carry
     return _lstm(precision, input_kernel, recurrent_kernel, bias, inputs, exists, carry)
+
+
+def lstm_carries(
+    params: Params,
+    inputs: jax.Array,
+    starts: jax.Array,
+    carry: Carry,
+    precision: str = "float32",
+) -> Carry:
+    """The carries after each token, [T, B, H], with a hand-written gradient.
+
+    Args:
+        params: of `init_lstm`.
+        inputs: [T, B, I].
+        starts: bool [T, B], tokens before which the carry is set to zero.
+        carry: [B, H], before the first token.
+        precision: of the products' factors.
+    """
+    bias = params["input_bias"] + params["recurrent_bias"]
+    kernels = params["input_kernel"], params["recurrent_kernel"]
+    return _carries(precision, *kernels, bias, inputs, starts, carry)
 
 
 def reference(params: Params, inputs: jax.Array, exists: jax.Array, carry: Carry) -> Carry:
@@ -171,13 +237,80 @@ def _backward(precision, residuals, gradient: Carry):
         return Carry(product(narrow(d_gates, precision), to_hidden), d_cell * f), d_gates
 
     start, d_gates = lax.scan(token, gradient, (exists, before.cell, activations), reverse=True)
+    return (*_sums(precision, residuals, d_gates), None, start)
+
+
+_lstm.defvjp(_forward, _backward)
+
+
+def _sums(precision, residuals, d_gates: jax.Array):
+    """Gradients of kernels, bias and inputs from those of the gates [T, B, 4H]: large products."""
+    input_kernel, _, inputs, _, before, _ = residuals
     d_bias = d_gates.sum(axis=(0, 1))
     d_gates = narrow(d_gates, precision)
     d_input_kernel = weight_gradient(inputs, d_gates)
     d_recurrent_kernel = weight_gradient(narrow(before.hidden, precision), d_gates)
     flat = d_gates.reshape(-1, d_gates.shape[-1])
     d_inputs = product(flat, input_kernel.T).reshape(inputs.shape)
-    return d_input_kernel, d_recurrent_kernel, d_bias, d_inputs, None, start
+    return d_input_kernel, d_recurrent_kernel, d_bias, d_inputs
 
 
-_lstm.defvjp(_forward, _backward)
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _carries(precision, input_kernel, recurrent_kernel, bias, inputs, starts, carry) -> Carry:
+    return _carries_forward(precision, input_kernel, recurrent_kernel, bias, inputs, starts, carry)[
+        0
+    ]
+
+
+def _carries_forward(precision, input_kernel, recurrent_kernel, bias, inputs, starts, carry):
+    input_kernel, recurrent_kernel, inputs = (
+        narrow(factor, precision) for factor in (input_kernel, recurrent_kernel, inputs)
+    )
+    projected = _project(input_kernel, bias, inputs)
+    present = jnp.ones((inputs.shape[1],), bool)
+
+    def token(carry: Carry, x):
+        gates, begins = x
+        carry = _reset(carry, begins)
+        recurrent = product(narrow(carry.hidden, precision), recurrent_kernel)
+        activations = _activate(gates + recurrent, present)
+        after = _cell(activations, carry.cell)
+        return after, (after, carry, activations)
+
+    _, (after, before, activations) = lax.scan(token, carry, (projected, starts))
+    return after, (input_kernel, recurrent_kernel, inputs, starts, before, activations)
+
+
+def _carries_backward(precision, residuals, gradients: Carry):
+    input_kernel, recurrent_kernel, inputs, starts, before, activations = residuals
+    to_hidden = lax.optimization_barrier(recurrent_kernel.T)
+
+    def token(later: Carry, x):
+        begins, own, cell_before, (i, f, g, o) = x
+        d_hidden, d_cell = later.hidden + own.hidden, later.cell + own.cell
+        tanh_cell = jnp.tanh(f * cell_before + i * g)
+        d_cell = d_cell + d_hidden * o * (1.0 - tanh_cell * tanh_cell)
+        d_gates = jnp.concatenate(
+            (
+                d_cell * g * i * (1.0 - i),
+                d_cell * cell_before * f * (1.0 - f),
+                d_cell * i * (1.0 - g * g),
+                d_hidden * tanh_cell * o * (1.0 - o),
+            ),
+            axis=-1,
+        )
+        earlier = Carry(product(narrow(d_gates, precision), to_hidden), d_cell * f)
+        return _reset(earlier, begins), d_gates
+
+    nothing = jax.tree.map(lambda leaf: jnp.zeros_like(leaf[0]), gradients)
+    xs = (starts, gradients, before.cell, activations)
+    start, d_gates = lax.scan(token, nothing, xs, reverse=True)
+    return (*_sums(precision, residuals, d_gates), None, start)
+
+
+_carries.defvjp(_carries_forward, _carries_backward)
+
+
+def _reset(carry: Carry, begins: jax.Array) -> Carry:
+    """``carry`` [B, H], zero where an episode ``begins`` [B]."""
+    return Carry(*(jnp.where(begins[:, None], jnp.zeros_like(part), part) for part in carry))

@@ -1,0 +1,211 @@
+"""`Agent`: networks, learner and what replay keeps for them, bound once for a configuration.
+
+Actions are in half ranges. Shapes: ``B`` batch, ``O`` and ``A`` sizes of an observation and an
+action.
+"""
+
+import dataclasses
+import functools
+from typing import Any, Protocol
+
+import jax
+
+from rtd3jax.agents.history import Window, next_window
+from rtd3jax.agents.hyperparameters import Hyperparameters
+from rtd3jax.agents.learners.base import Learner, Metrics, Networks
+from rtd3jax.agents.memory.base import Carry, Memory, Params
+from rtd3jax.agents.networks import (
+    Network,
+    act,
+    carry_before,
+    init_network,
+    make_network,
+    part_sizes,
+)
+from rtd3jax.agents.replay import Batch, Replay, empty_replay, sample
+from rtd3jax.agents.variants import Variant
+from rtd3jax.config import Config
+from rtd3jax.registries import AGENTS, LEARNERS, MEMORIES
+
+
+class Sizes(Protocol):
+    """What an agent must know of an environment, such as its `rtd3jax.envs.interface.Interface`."""
+
+    @property
+    def observation_size(self) -> int:
+        """O."""
+
+    @property
+    def action_size(self) -> int:
+        """A."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Agent:
+    """Pure functions over one lane's arrays.
+
+    Attributes:
+        variant: what the agent is.
+        networks: actor and critic, with wide products in the configuration's precision.
+        acting: the actor in float32, as policies have it.
+        learner: what trains them.
+        config: the configuration.
+        observation_size: O.
+        action_size: A.
+    """
+
+    variant: Variant
+    networks: Networks
+    acting: Network
+    learner: Learner
+    config: Config
+    observation_size: int
+    action_size: int
+
+    @property
+    def tokens(self) -> int:
+        """Past tokens in a window's arrays."""
+        return self.config.tokens
+
+    @property
+    def metrics(self) -> tuple[str, ...]:
+        """Names of what `update` measures."""
+        return self.learner.metrics
+
+    def init(self, key: jax.Array) -> Any:
+        """The learner's state at the start; its ``actor`` is the actor's parameters."""
+        return self.learner.init(key, self.networks)
+
+    def empty_replay(self) -> Replay:
+        """The ring in which the agent's transitions are kept."""
+        carry = self.acting.zero_carry(1) if self.variant.stores_carry else None
+        return empty_replay(self.config.capacity, self.observation_size, self.action_size, carry)
+
+    def act(self, actor: Params, window: Window) -> tuple[jax.Array, Carry | None]:
+        """The deterministic action [B, A], and the carry that replay keeps, if it does."""
+        carry = None
+        if self.variant.stores_carry:
+            carry = carry_before(self.acting, actor, window)
+        return act(self.acting, actor, window, carry), carry
+
+    def final_carry(
+        self,
+        actor: Params,
+        window: Window,
+        action: jax.Array,
+        final_observation: jax.Array,
+        history_length: jax.Array,
+    ) -> Carry:
+        """The carry before an episode's final observation [B, O], after ``action`` [B, A]."""
+        after = next_window(window, action, final_observation, history_length)
+        return carry_before(self.acting, actor, after)
+
+    def sample(
+        self, replay: Replay, key: jax.Array, count: jax.Array, history_length: jax.Array
+    ) -> Batch:
+        """A batch of the ``count`` steps written so far."""
+        size = self.config.batch_size
+        return sample(replay, key, count, size, self.tokens, history_length)
+
+    def update(
+        self,
+        state: Any,
+        batch: Batch,
+        keys: jax.Array,
+        numbers: Hyperparameters,
+        count: jax.Array,
+    ) -> tuple[Any, Metrics]:
+        """The ``count``-th update (int32 [], from 1); ``keys`` [2] are consumed here."""
+        return self.learner.update(self.networks, state, batch, keys, numbers, count)
+
+
+def make_agent(config: Config, interface: Sizes) -> Agent:
+    """The agent of ``config`` for environments of ``interface``.
+
+    Raises:
+        UserError: when the agent, its memory or its learner is unknown, or does not keep to its
+            interface.
+    """
+    variant: Variant = AGENTS[config.algorithm]
+    sizes = interface.observation_size, interface.action_size, config.hidden_size
+    actor, critic = (
+        make_part(variant, role, config.memory, *sizes, config.precision)
+        for role in ("actor", "critic")
+    )
+    return Agent(
+        variant=variant,
+        networks=Networks(actor, critic),
+        acting=make_part(variant, "actor", config.memory, *sizes),
+        learner=LEARNERS[variant.learner](config),
+        config=config,
+        observation_size=interface.observation_size,
+        action_size=interface.action_size,
+    )
+
+
+def make_part(
+    variant: Variant,
+    role: str,
+    memory: str,
+    observation_size: int,
+    action_size: int,
+    width: int,
+    precision: str = "float32",
+) -> Network:
+    """An agent's ``actor`` or ``critic``.
+
+    Args:
+        variant: the agent.
+        role: which of the two.
+        memory: the name of its recurrent cell.
+        observation_size: O.
+        action_size: A.
+        width: of every layer.
+        precision: of the factors of wide products.
+    """
+    # The class stands in the key, so that a memory that replaced another is seen.
+    sizes = observation_size, action_size, width
+    return _part(variant, role, memory, MEMORIES[memory], *sizes, precision)
+
+
+def count_parameters(
+    algorithm: str,
+    obs_dim: int,
+    act_dim: int,
+    hidden_size: int = 128,
+    memory: str = "lstm",
+) -> dict[str, int]:
+    """Numbers of parameters of one actor and one critic, counted from initialised ones.
+
+    ``count_parameters("lstm-td3", obs_dim=3, act_dim=1)`` gives the paper's Table 5.
+    """
+    variant = AGENTS[algorithm]
+
+    def count(role: str) -> int:
+        network = make_part(variant, role, memory, obs_dim, act_dim, hidden_size)
+        params = jax.eval_shape(lambda: init_network(jax.random.key(0), network))
+        return sum(leaf.size for leaf in jax.tree.leaves(params))
+
+    return {role: count(role) for role in ("actor", "critic")}
+
+
+@functools.cache
+def _part(
+    variant: Variant,
+    role: str,
+    memory: str,
+    module: type[Memory],
+    observation_size: int,
+    action_size: int,
+    width: int,
+    precision: str,
+) -> Network:
+    return make_network(
+        getattr(variant, role),
+        memory,
+        part_sizes(observation_size, action_size),
+        width,
+        action_size if role == "actor" else 1,
+        precision,
+        variant.encoder,
+    )

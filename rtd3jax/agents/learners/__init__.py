@@ -1,0 +1,6 @@
+"""Learners: what trains an agent's networks from batches of its replay."""
+
+from rtd3jax.agents.learners.base import register_learner
+from rtd3jax.agents.learners.td3 import make_td3
+
+register_learner("td3", make_td3)

@@ -1,0 +1,272 @@
+"""TD3's targets, losses and updates (Fujimoto et al., 2018), over any of the six agents.
+
+Actions in here are in half ranges about the centre of the environment's range, within [-1, 1], so
+that an agent learns the same in whatever unit the environment takes its actions; `Bounds` converts
+at the border. Shapes: ``B`` batch, ``A`` action elements.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jax import lax
+
+from rtd3jax.agents.history import Window
+from rtd3jax.agents.hyperparameters import Hyperparameters
+from rtd3jax.agents.learners.base import Measured, Metrics, Networks, measured, not_measured
+from rtd3jax.agents.memory.base import Params
+from rtd3jax.agents.networks import Network, act, apply_network, carry_before, init_network
+from rtd3jax.agents.noise import add_noise
+from rtd3jax.agents.replay import Batch
+from rtd3jax.config import Config
+
+Critics = tuple[Params, Params]
+
+SATURATED = 0.99
+"""An action beyond this share of its half range counts as saturated."""
+
+NORMS_EVERY = 16
+"""Updates of the critics for one measurement of the gradients' norms, which read all parameters."""
+
+
+@struct.dataclass
+class TD3State:
+    """Online and target networks, and Adam's moments."""
+
+    actor: Params
+    critics: Critics
+    target_actor: Params
+    target_critics: Critics
+    actor_optimizer: optax.OptState
+    critic_optimizer: optax.OptState
+
+
+_MOMENTUM = 0.9
+# The learning rate is a lane's own number, applied in _descend.
+_ADAM = optax.scale_by_adam(b1=_MOMENTUM)
+
+
+@dataclasses.dataclass(frozen=True)
+class TD3:
+    """The learner; see `rtd3jax.agents.learners.base.Learner`.
+
+    Attributes:
+        policy_delay: critic updates per update of the actor and the targets.
+    """
+
+    policy_delay: int = 2
+
+    metrics = (
+        "critic_loss",
+        "critic_loss_1",
+        "critic_loss_2",
+        "action_value",
+        "target",
+        "actor_loss",
+        "saturated_actions",
+        "critic_gradient_norm",
+        "actor_gradient_norm",
+    )
+
+    def init(self, key: jax.Array, networks: Networks) -> TD3State:
+        """A state whose targets equal its online networks."""
+        actor_key, first_key, second_key = jax.random.split(key, 3)
+        actor = init_network(actor_key, networks.actor)
+        critics = (
+            init_network(first_key, networks.critic),
+            init_network(second_key, networks.critic),
+        )
+        return TD3State(
+            actor=actor,
+            critics=critics,
+            # Copies: a donated buffer must not appear twice.
+            target_actor=jax.tree.map(jnp.copy, actor),
+            target_critics=jax.tree.map(jnp.copy, critics),
+            actor_optimizer=_ADAM.init(actor),
+            critic_optimizer=_ADAM.init(critics),
+        )
+
+    def update(
+        self,
+        networks: Networks,
+        state: TD3State,
+        batch: Batch,
+        keys: jax.Array,
+        numbers: Hyperparameters,
+        count: jax.Array,
+    ) -> tuple[TD3State, Metrics]:
+        """The critics' update, and every ``policy_delay``-th time the actor's and the targets'."""
+        norms = count % NORMS_EVERY == 0
+        state, critic = update_critics(networks, state, batch, keys[0], numbers, norms)
+        state, actor = lax.cond(
+            count % self.policy_delay == 0,
+            lambda before: update_actor_and_targets(
+                networks, before, batch, keys[1], numbers, norms
+            ),
+            lambda before: (before, {name: not_measured() for name in ACTOR_METRICS}),
+            state,
+        )
+        return state, critic | actor
+
+
+def make_td3(config: Config) -> TD3:
+    """The learner of a configuration."""
+    return TD3(config.policy_delay)
+
+
+def target(
+    networks: Networks,
+    state: TD3State,
+    batch: Batch,
+    key: jax.Array,
+    numbers: Hyperparameters,
+) -> jax.Array:
+    """``y = r + gamma (1 - terminated) min_i Q'_i(next, smoothed target action)``: [B].
+
+    ``r`` is the reward times ``reward_scale``.
+    """
+    action = act(networks.actor, state.target_actor, batch.next_window)
+    noise = numbers.target_noise * jax.random.normal(key, action.shape, jnp.float32)
+    clip = numbers.target_noise_clip
+    action = jnp.clip(action + jnp.clip(noise, -clip, clip), -1.0, 1.0)
+    first, second = (
+        _value(networks.critic, critic, batch.next_window, action, batch.next_carry)
+        for critic in state.target_critics
+    )
+    bootstrap = jnp.where(batch.terminated, 0.0, jnp.minimum(first, second))
+    return numbers.reward_scale * batch.reward + numbers.gamma * bootstrap
+
+
+def critic_loss(
+    params: Params, critic: Network, batch: Batch, y: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """One critic's mean-squared error against ``y`` [B], and its mean value.
+
+    The loss is the sum over the two critics.
+    """
+    value = _value(critic, params, batch.window, batch.action, batch.carry)
+    error = value - y
+    return jnp.mean(error**2), jnp.mean(value)
+
+
+def actor_loss(
+    params: Params,
+    critic_params: Params,
+    networks: Networks,
+    batch: Batch,
+    key: jax.Array,
+    noise: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """Minus the first critic's mean value of the actor's actions; and the share that is saturated.
+
+    With ``noise`` [] > 0 the value is averaged over noise on the actions, and the actor climbs a
+    smoothed action value (Nachum et al., 2018), by one draw for each of the batch: a critic knows
+    the value around where exploration went, while its slope at a single action is mostly kinks.
+    With 0 it is TD3's loss.
+    """
+    greedy = act(networks.actor, params, batch.window)
+    action = add_noise(key, greedy, noise)
+    carry = batch.carry
+    if carry is None and networks.critic.reads.memory:
+        # No past token depends on the actor: the critic's prefix needs no tape.
+        carry = carry_before(networks.critic, critic_params, batch.window)
+    saturated = jnp.mean((jnp.abs(greedy) > SATURATED).astype(jnp.float32))
+    value = _value(networks.critic, critic_params, batch.window, action, carry)
+    return -jnp.mean(value), saturated
+
+
+def update_critics(
+    networks: Networks,
+    state: TD3State,
+    batch: Batch,
+    key: jax.Array,
+    numbers: Hyperparameters,
+    norms: jax.Array,
+) -> tuple[TD3State, Metrics]:
+    """One Adam step of both critics; ``norms`` bool [], whether to measure the gradient's norm."""
+    y = target(networks, state, batch, key, numbers)
+    pair = jax.tree.map(lambda *leaves: jnp.stack(leaves), *state.critics)
+    # One after the other, so that one tape is alive at a time: two do not fit in a CPU's cache.
+    (losses, values), gradients = lax.map(
+        lambda params: jax.value_and_grad(critic_loss, has_aux=True)(
+            params, networks.critic, batch, y
+        ),
+        pair,
+    )
+    gradient = tuple(jax.tree.map(lambda leaf, i=i: leaf[i], gradients) for i in range(2))
+    critics, optimizer = _descend(
+        state.critics, gradient, state.critic_optimizer, numbers.critic_learning_rate
+    )
+    metrics = {
+        "critic_loss": measured(jnp.sum(losses)),
+        "critic_loss_1": measured(losses[0]),
+        "critic_loss_2": measured(losses[1]),
+        "action_value": measured(values[0]),
+        "target": measured(jnp.mean(y)),
+        "critic_gradient_norm": _norm(norms, gradients),
+    }
+    return dataclasses.replace(state, critics=critics, critic_optimizer=optimizer), metrics
+
+
+ACTOR_METRICS = ("actor_loss", "saturated_actions", "actor_gradient_norm")
+
+
+def update_actor_and_targets(
+    networks: Networks,
+    state: TD3State,
+    batch: Batch,
+    key: jax.Array,
+    numbers: Hyperparameters,
+    norms: jax.Array,
+) -> tuple[TD3State, Metrics]:
+    """One Adam step of the actor, then Polyak averaging of all targets."""
+    (loss, saturated), gradient = jax.value_and_grad(actor_loss, has_aux=True)(
+        state.actor, state.critics[0], networks, batch, key, numbers.actor_noise
+    )
+    actor, optimizer = _descend(
+        state.actor, gradient, state.actor_optimizer, numbers.actor_learning_rate
+    )
+    tau, before = numbers.tau, state.actor_optimizer.mu
+
+    def average(online, target):
+        return jax.tree.map(lambda new, old: old + tau * (new - old), online, target)
+
+    state = dataclasses.replace(
+        state,
+        actor=actor,
+        actor_optimizer=optimizer,
+        target_actor=average(actor, state.target_actor),
+        target_critics=average(state.critics, state.target_critics),
+    )
+    # A second reader of the gradient would make XLA round Adam's step in another way.
+    norm = _norm_from_moments(norms, before, optimizer.mu)
+    found = measured(loss), measured(saturated), norm
+    return state, dict(zip(ACTOR_METRICS, found, strict=True))
+
+
+def _value(critic: Network, params: Params, window: Window, action, carry) -> jax.Array:
+    return apply_network(critic, params, window, action, carry)[:, 0]
+
+
+def _norm(wanted: jax.Array, gradient: Params) -> Measured:
+    """The Euclidean norm of all of ``gradient``, where it is ``wanted``."""
+    return lax.cond(wanted, lambda: measured(optax.tree.norm(gradient)), not_measured)
+
+
+def _norm_from_moments(wanted: jax.Array, before: Params, after: Params) -> Measured:
+    """`_norm` of the gradient that took Adam's first moments from ``before`` to ``after``."""
+
+    def measure() -> Measured:
+        share = 1.0 - _MOMENTUM
+        gradient = jax.tree.map(lambda new, old: (new - _MOMENTUM * old) / share, after, before)
+        return measured(optax.tree.norm(gradient))
+
+    return lax.cond(wanted, measure, not_measured)
+
+
+def _descend(params, gradient, optimizer, learning_rate):
+    with jax.numpy_dtype_promotion("standard"):  # optax relies on it
+        direction, optimizer = _ADAM.update(gradient, optimizer)
+    return jax.tree.map(lambda p, d: p - learning_rate * d, params, direction), optimizer

@@ -1,0 +1,76 @@
+"""A gated recurrent unit (Cho et al., 2014), in the form whose reset gate acts on the product.
+
+Shapes: ``T`` tokens, ``B`` batch, ``I`` inputs, ``H`` width.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from rtd3jax.agents.memory.base import Memory, Params
+from rtd3jax.agents.products import matmul
+
+
+class GRU(Memory):
+    """Gates in the order reset, update, candidate. The carry [B, H] is the output."""
+
+    def setup(self) -> None:
+        names = ("input_kernel", "recurrent_kernel", "input_bias", "recurrent_bias")
+        self.kernels = {
+            name: self.param(name, lambda key, name=name: self.initial(key)[name]) for name in names
+        }
+
+    def initial(self, key: jax.Array) -> Params:
+        """Uniform in ±1/sqrt(H)."""
+        bound, width = self.width**-0.5, self.width
+        shapes = {
+            "input_kernel": (self.inputs, 3 * width),
+            "recurrent_kernel": (width, 3 * width),
+            "input_bias": (3 * width,),
+            "recurrent_bias": (3 * width,),
+        }
+        keys = jax.random.split(key, len(shapes))
+        return {
+            name: jax.random.uniform(k, shape, jnp.float32, -bound, bound)
+            for k, (name, shape) in zip(keys, shapes.items(), strict=True)
+        }
+
+    def zero(self, batch: int) -> jax.Array:
+        """Zeros [B, H]."""
+        return jnp.zeros((batch, self.width), jnp.float32)
+
+    def step(self, carry: jax.Array, token: jax.Array) -> jax.Array:
+        """``n + z * (h - n)`` with ``n = tanh(W x + r * (U h))``."""
+        return self._cell(carry, self._project(token))
+
+    def carries(self, carry: jax.Array | None, tokens: jax.Array, starts: jax.Array) -> jax.Array:
+        """The carries after each token, [T, B, H]; the inputs' product is taken once for all."""
+        flat = tokens.reshape(-1, tokens.shape[-1])
+        projected = self._project(flat).reshape(*tokens.shape[:2], -1)
+
+        def step(carry: jax.Array, x: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            gates, begins = x
+            after = self._cell(jnp.where(begins[:, None], 0.0, carry), gates)
+            return after, after
+
+        start = self.zero(tokens.shape[1]) if carry is None else carry
+        return lax.scan(step, start, (projected, starts))[1]
+
+    def operations(self) -> tuple[float, float]:
+        """Of the input's product and of the carry's."""
+        return 6.0 * self.inputs * self.width, 6.0 * self.width * self.width
+
+    def _project(self, token: jax.Array) -> jax.Array:
+        kernels = self.kernels
+        product = matmul(token, kernels["input_kernel"], self.precision)
+        return product + kernels["input_bias"][None, :]
+
+    def _cell(self, carry: jax.Array, projected: jax.Array) -> jax.Array:
+        kernels = self.kernels
+        recurrent = matmul(carry, kernels["recurrent_kernel"], self.precision)
+        recurrent = recurrent + kernels["recurrent_bias"][None, :]
+        width = self.width
+        gates = jax.nn.sigmoid(projected[:, : 2 * width] + recurrent[:, : 2 * width])
+        reset, update = jnp.split(gates, 2, axis=-1)
+        candidate = jnp.tanh(projected[:, 2 * width :] + reset * recurrent[:, 2 * width :])
+        return candidate + update * (carry - candidate)
