@@ -1,9 +1,10 @@
 """Learning curves in the trackers that people already use, fed between chunks.
 
-A lane is a run of the tracker, named as in the run directory; its metrics are ``evaluation/return``
-against environment steps. A lane that goes on from a checkpoint goes on in its run. Where a tracker
-keeps its files or sends them is for its own environment variables to say (``WANDB_MODE``,
-``MLFLOW_TRACKING_URI``); by default all of it stays in the run directory.
+A lane is a run of the tracker, named as in the run directory; its metrics against environment steps
+are ``evaluation/return`` and those of learning, such as ``learning/critic_loss``. A lane that goes
+on from a checkpoint goes on in its run. Where a tracker keeps its files or sends them is for its
+own environment variables to say (``WANDB_MODE``, ``MLFLOW_TRACKING_URI``); by default all of it
+stays in the run directory.
 """
 
 import abc
@@ -21,13 +22,15 @@ from rtd3jax.study.plan import Cell
 from rtd3jax.study.rundir import RunDirectory, cell_name
 
 METRIC = "evaluation/return"
+LEARNING = "learning/"
+"""How the names of the metrics of learning begin."""
 
 
 class Logger(Protocol):
     """What takes the rows of the log as they are written."""
 
     def log(self, cell: Cell, seed: int, row: dict[str, Any]) -> None:
-        """Take ``row``, which has ``step`` and ``return`` (None where it is not finite)."""
+        """Take ``row``: ``step``, ``return`` and ``metrics`` (None for what is not finite)."""
 
     def close(self) -> None:
         """Write what is not written yet."""
@@ -45,8 +48,11 @@ class PerLane(abc.ABC):
         lane = cell_name(cell), seed
         if lane not in self._runs:
             self._runs[lane] = self._begin(cell, seed)
-        if row["return"] is not None:
-            self._point(self._runs[lane], row["return"], row["step"])
+        values = {METRIC: row["return"]}
+        values |= {LEARNING + name: value for name, value in row["metrics"].items()}
+        finite = {name: value for name, value in values.items() if value is not None}
+        if finite:
+            self._points(self._runs[lane], finite, row["step"])
 
     def close(self) -> None:
         """End the runs."""
@@ -58,8 +64,8 @@ class PerLane(abc.ABC):
         """The lane's run."""
 
     @abc.abstractmethod
-    def _point(self, run: Any, value: float, step: int) -> None:
-        """Write one value of `METRIC`."""
+    def _points(self, run: Any, values: dict[str, float], step: int) -> None:
+        """Write the values of some metrics."""
 
     @abc.abstractmethod
     def _end(self, run: Any) -> None:
@@ -76,8 +82,9 @@ class TensorBoard(PerLane):
     def _begin(self, cell: Cell, seed: int) -> Any:
         return self._make(str(self._path / "tensorboard" / cell_name(cell) / f"seed-{seed}"))
 
-    def _point(self, run: Any, value: float, step: int) -> None:
-        run.add_scalar(METRIC, value, step)
+    def _points(self, run: Any, values: dict[str, float], step: int) -> None:
+        for name, value in values.items():
+            run.add_scalar(name, value, step)
 
     def _end(self, run: Any) -> None:
         run.close()
@@ -102,11 +109,12 @@ class WandB(PerLane):
             name=f"{name} seed {seed}",
             config={**cell.to_dict(), "seed": seed},
         )
-        run.define_metric(METRIC, step_metric="step")
+        for name in (METRIC, f"{LEARNING}*"):
+            run.define_metric(name, step_metric="step")
         return run
 
-    def _point(self, run: Any, value: float, step: int) -> None:
-        run.log({METRIC: value, "step": step})
+    def _points(self, run: Any, values: dict[str, float], step: int) -> None:
+        run.log({**values, "step": step})
 
     def _end(self, run: Any) -> None:
         run.finish()
@@ -135,8 +143,9 @@ class MLflow(PerLane):
             self._client.log_param(run.info.run_id, key, value)
         return run.info.run_id
 
-    def _point(self, run: str, value: float, step: int) -> None:
-        self._client.log_metric(run, METRIC, value, step=step)
+    def _points(self, run: str, values: dict[str, float], step: int) -> None:
+        for name, value in values.items():
+            self._client.log_metric(run, name, value, step=step)
 
     def _end(self, run: str) -> None:
         self._client.set_terminated(run)

@@ -13,7 +13,7 @@ from rtd3jax.study.plan import label
 from rtd3jax.study.rundir import LOG, RunDirectory
 from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.lanes import Group, Job
-from rtd3jax.training.run import curves_of, evaluation_steps, failure_of
+from rtd3jax.training.run import curves_of, evaluation_steps, failure_of, metric_curves
 
 
 class Recorder:
@@ -57,7 +57,7 @@ class Recorder:
                 self._early.refresh()
 
     def _log(self, group: Group) -> None:
-        assert group.returns is not None
+        assert group.returns is not None and group.metrics is not None
         with (self._directory.path / LOG).open("a") as log:
             for index, job in enumerate(group.jobs):
                 cell, seed = job.owner
@@ -71,6 +71,12 @@ class Recorder:
                         **lane,
                         "return": _json_number(curve[k]),
                         "seconds": round(time.perf_counter() - self._began, 3),
+                        "metrics": {
+                            name: _json_number(value)
+                            for name, value in zip(
+                                job.program.metric_names, group.metrics[index, k], strict=True
+                            )
+                        },
                     }
                     log.write(json.dumps(row) + "\n")
                     if self._logger is not None:
@@ -100,6 +106,7 @@ class Recorder:
                 "final_returns": final[0],
                 "final_true_returns": final[1],
             },
+            metric_curves(cell.config, state, failure),
             None if failure is None else {"step": failure.step, "reason": failure.reason},
         )
 

@@ -28,15 +28,20 @@ REFERENCES = ("random", "constant")
 CELL = ("env", "disturbance", "algorithm", "history_length")
 
 
+_LANE = [
+    pa.field("env", pa.string(), nullable=False),
+    pa.field("disturbance", pa.string(), nullable=False),
+    pa.field("algorithm", pa.string(), nullable=False),
+    pa.field("history_length", pa.int32(), nullable=False),
+    pa.field("seed", pa.int64(), nullable=False),
+]
+
+
 def _schema(index: pa.Field) -> pa.Schema:
     """Schema with the lane columns, one ``index`` column inside the lane, and the returns."""
     return pa.schema(
         [
-            pa.field("env", pa.string(), nullable=False),
-            pa.field("disturbance", pa.string(), nullable=False),
-            pa.field("algorithm", pa.string(), nullable=False),
-            pa.field("history_length", pa.int32(), nullable=False),
-            pa.field("seed", pa.int64(), nullable=False),
+            *_LANE,
             index,
             # Undiscounted sums of rewards over an episode, in the environment's reward units:
             # as rewarded to the agent, and as computed from the undisturbed state.
@@ -50,6 +55,15 @@ def _schema(index: pa.Field) -> pa.Schema:
 CURVES = _schema(pa.field("step", pa.int64(), nullable=False))
 # Final evaluation: one row per lane and evaluation episode, numbered from 0.
 EPISODES = _schema(pa.field("episode", pa.int32(), nullable=False))
+# Metrics of learning: a row per lane, evaluation and metric, averaged since the evaluation before.
+METRICS = pa.schema(
+    [
+        *_LANE,
+        pa.field("step", pa.int64(), nullable=False),
+        pa.field("metric", pa.string(), nullable=False),
+        pa.field("value", pa.float32(), nullable=False),
+    ]
+)
 
 
 def key_columns(schema: pa.Schema) -> list[str]:
@@ -96,7 +110,7 @@ def read_table(path: str | os.PathLike, schema: pa.Schema | None = None) -> pd.D
             table = file.read()
     except (pa.ArrowException, OSError) as error:
         raise UserError(f"{path} is not a readable Parquet file: {error}") from error
-    expected = [CURVES, EPISODES] if schema is None else [schema]
+    expected = [CURVES, EPISODES, METRICS] if schema is None else [schema]
     if not any(table.schema.equals(candidate) for candidate in expected):
         wanted = " or ".join(_describe(candidate) for candidate in expected)
         raise UserError(f"{path} has columns {_describe(table.schema)}; expected {wanted}")

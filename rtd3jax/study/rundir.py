@@ -29,6 +29,7 @@ from rtd3jax.study.results import (
     CELL,
     CURVES,
     EPISODES,
+    METRICS,
     REFERENCES,
     read_table,
     write_table,
@@ -175,6 +176,7 @@ class RunDirectory:
         seed: int,
         actor: Any,
         curves: dict[str, np.ndarray],
+        metrics: dict[str, np.ndarray],
         failure: dict[str, Any] | None,
     ) -> None:
         """Keep a lane that ended.
@@ -185,10 +187,12 @@ class RunDirectory:
             actor: parameters of the actor, a nested dict.
             curves: ``steps``, ``returns``, ``true_returns`` [K] and ``final_returns``,
                 ``final_true_returns`` [episodes].
+            metrics: of learning, [K] by name.
             failure: step and reason, if the lane was lost.
         """
         arrays = {f"actor.{name}": value for name, value in flatten(actor).items()}
         arrays |= {f"results.{name}": np.asarray(value) for name, value in curves.items()}
+        arrays |= {f"metrics.{name}": np.asarray(value) for name, value in metrics.items()}
         about = {"format": FORMAT, "cell": cell.to_dict(), "seed": seed, "failure": failure}
         write_arrays(self.lane_path(cell, seed), arrays, about)
 
@@ -274,14 +278,16 @@ class RunDirectory:
         curves: list[dict[str, Any]] = []
         episodes: list[dict[str, Any]] = []
         failures: list[dict[str, Any]] = []
+        metrics: list[dict[str, Any]] = []
         for cell in self.cells:
             for seed in self.seeds:
                 if self.is_done(cell, seed):
-                    self._read_lane(cell, seed, curves, episodes, failures)
+                    self._read_lane(cell, seed, curves, episodes, metrics, failures)
         for reference in references:
             episodes += _reference_rows(reference)
         write_table(self.path / "curves.parquet", curves, CURVES)
         write_table(self.path / "episodes.parquet", episodes, EPISODES)
+        write_table(self.path / "metrics.parquet", metrics, METRICS)
         curve_table = read_table(self.path / "curves.parquet", CURVES)
         episode_table = read_table(self.path / "episodes.parquet", EPISODES)
         best = ceilings_of(self.path, self.cells, compute=False)
@@ -291,7 +297,15 @@ class RunDirectory:
             learning_curves(curve_table, episode_table, self.path, best)
             final_returns(episode_table, self.path, best)
 
-    def _read_lane(self, cell: Cell, seed: int, curves: list, episodes: list, failures: list):
+    def _read_lane(
+        self,
+        cell: Cell,
+        seed: int,
+        curves: list[dict[str, Any]],
+        episodes: list[dict[str, Any]],
+        metrics: list[dict[str, Any]],
+        failures: list[dict[str, Any]],
+    ) -> None:
         path = self.lane_path(cell, seed)
         row = {**cell.key, "seed": seed}
         try:
@@ -306,6 +320,12 @@ class RunDirectory:
             episodes += [
                 {**row, "episode": episode, "return": value, "true_return": true}
                 for episode, (value, true) in enumerate(finals)
+            ]
+            metrics += [
+                {**row, "step": int(step), "metric": name.removeprefix("metrics."), "value": value}
+                for name in sorted(arrays)
+                if name.startswith("metrics.")
+                for step, value in zip(arrays["results.steps"], arrays[name], strict=True)
             ]
         except (UserError, KeyError, ValueError, TypeError) as error:
             raise UserError(

@@ -55,6 +55,7 @@ class Group:
         state: of all lanes, with a leading axis where there are several; None before the start.
         step: steps done.
         returns: the curves so far on the host, [lanes, K]: ``state`` may be in use on a device.
+        metrics: likewise, of learning: [lanes, K, M].
         lost: whether every lane has failed.
         error: what a failed group raised.
     """
@@ -64,6 +65,7 @@ class Group:
     state: LaneState | None = None
     step: int = 0
     returns: np.ndarray | None = None
+    metrics: np.ndarray | None = None
     lost: bool = False
     error: BaseException | None = None
 
@@ -249,6 +251,8 @@ def _restore(group: Group, checkpoints: Checkpoints) -> None:
 
 def _advanced(group: Group, state: LaneState, step: int) -> None:
     group.returns = np.atleast_2d(np.asarray(state.returns))
+    metrics = np.asarray(state.metrics.curves)
+    group.metrics = metrics if metrics.ndim == 3 else metrics[None]
     group.lost = bool(np.all(np.asarray(state.failure) != HEALTHY))
     group.state, group.step = state, step
 

@@ -31,7 +31,14 @@ from rtd3jax.config import Config, traced_fields
 from rtd3jax.envs.interface import action_bounds, foreign_code
 from rtd3jax.evaluate import episode_returns
 from rtd3jax.policy import Policy
-from rtd3jax.training.metrics import Averages, averaged, empty_averages, note_reward, note_update
+from rtd3jax.training.metrics import (
+    Averages,
+    averaged,
+    empty_averages,
+    metric_names,
+    note_reward,
+    note_update,
+)
 
 HEALTHY, ENVIRONMENT_NOT_FINITE, LOSS_NOT_FINITE = 0, 1, 2
 
@@ -115,6 +122,11 @@ class Program:
     def tokens(self) -> int:
         """Past tokens in the window's arrays."""
         return self.config.tokens
+
+    @property
+    def metric_names(self) -> tuple[str, ...]:
+        """Names of the metrics of learning, in the order of their curves."""
+        return metric_names(self.agent.metrics)
 
     @property
     def evaluations(self) -> int:

@@ -34,9 +34,14 @@ class Averages:
     names: tuple[str, ...] = struct.field(pytree_node=False)
 
 
-def empty_averages(names: tuple[str, ...], evaluations: int) -> Averages:
-    """Before the first step, for a learner that measures ``names``."""
-    names = (*names, EXPLORATION_RETURN)
+def metric_names(learner: tuple[str, ...]) -> tuple[str, ...]:
+    """All names, where the learner measures those of ``learner``."""
+    return (*learner, EXPLORATION_RETURN)
+
+
+def empty_averages(learner: tuple[str, ...], evaluations: int) -> Averages:
+    """Before the first step, for a learner that measures ``learner``."""
+    names = metric_names(learner)
     zeros = jnp.zeros((len(names),), jnp.float32)
     curves = jnp.full((evaluations, len(names)), jnp.nan, jnp.float32)
     return Averages(zeros, zeros.copy(), jnp.float32(0.0), curves, names)

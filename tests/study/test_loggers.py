@@ -11,6 +11,7 @@ from rtd3jax.study.loggers import METRIC, check_loggers, open_loggers
 from rtd3jax.study.plan import Grid, make_cells
 from rtd3jax.study.rundir import RunDirectory
 
+LOSS = "learning/critic_loss"
 ROWS = [(20, -3.5), (40, None), (60, -1.25)]
 
 
@@ -25,7 +26,8 @@ def feed(name, directory, rows=ROWS):
         for cell in directory.cells:
             for seed in directory.seeds:
                 for step, value in rows:
-                    logger.log(cell, seed, {"step": step, "return": value})
+                    metrics = {"critic_loss": None if value is None else -2 * value}
+                    logger.log(cell, seed, {"step": step, "return": value, "metrics": metrics})
 
 
 def test_tensorboard(directory):
@@ -42,7 +44,8 @@ def test_tensorboard(directory):
             event = Event.FromString(data[12 : 12 + length])
             points += [(event.step, v.tag, v.simple_value) for v in event.summary.value]
             data = data[16 + length :]
-        assert points == [(20, METRIC, -3.5), (60, METRIC, -1.25)]
+        expected = [(20, METRIC, -3.5), (20, LOSS, 7.0), (60, METRIC, -1.25), (60, LOSS, 2.5)]
+        assert points == expected
 
 
 def test_mlflow_goes_on_in_the_run_of_a_lane(directory):
@@ -57,6 +60,8 @@ def test_mlflow_goes_on_in_the_run_of_a_lane(directory):
     for run in runs:
         points = client.get_metric_history(run.info.run_id, METRIC)
         assert [(p.step, p.value) for p in points] == [(20, -3.5), (60, -1.25)]
+        losses = client.get_metric_history(run.info.run_id, LOSS)
+        assert [(p.step, p.value) for p in losses] == [(20, 7.0), (60, 2.5)]
         assert run.data.params["env"] == "rover"
 
 
@@ -80,6 +85,7 @@ def test_a_sweep_feeds_them(tmp_path, monkeypatch):
             pass
 
         def log(self, cell, seed, row):
+            assert row["metrics"]["critic_loss"] > 0
             rows.append((cell.config.algorithm, seed, row["step"]))
 
         def close(self):

@@ -39,9 +39,9 @@ def make_run(out, grid):
             curves = {"steps": np.array(STEPS), "returns": chance.normal(-3, 1, 3)}
             final = chance.normal(-2, 1, 2)
             curves |= {"true_returns": curves["returns"], "final_returns": final}
-            directory.write_lane(
-                cell, seed, policy.actor, {**curves, "final_true_returns": final}, None
-            )
+            curves |= {"final_true_returns": final}
+            metrics = {"critic_loss": np.array([np.nan, 2.0 + seed, 1.0], np.float32)}
+            directory.write_lane(cell, seed, policy.actor, curves, metrics, None)
     chance = np.random.default_rng(1)
     references = [
         Reference(env, disturbance, "random", *chance.normal(-4, 1, (2, 3)))
@@ -84,6 +84,8 @@ def test_the_numbers_are_those_of_the_tables(runs):
         name = data["agents"][cell["agent"]]["name"]
         world = data["worlds"][cell["world"]]["disturbance"]
         key = {"algorithm": name, "disturbance": world, "history_length": cell["length"]}
+        loss = cell["learning"]["critic_loss"]
+        assert loss["steps"] == [40, 60] and loss["iqm"] == [2.5, 1.0]  # means over two seeds
         final = rows_of(episodes, key).groupby("seed")["return"].mean()
         assert cell["final"]["return"]["mean"] == pytest.approx(final.mean(), rel=1e-4)
         points = rows_of(curves, key).groupby("step")["return"].mean()
@@ -131,6 +133,14 @@ def test_in_a_browser(env, runs):
         assert lines.count() == before // 2
         page.locator("#filters input[value='0'][name='agent']").press("Space")
         assert lines.count() == before
+
+        # What was measured while they learned is folded, and drawn once it is asked for.
+        assert page.locator("#learning .agent-line").count() == 0
+        page.locator("#learning summary").click()
+        assert page.locator("#learning .agent-line").count() == before
+        assert "critic loss" in page.locator("#learning figcaption").first.inner_text()
+        if pictures := os.environ.get("RTD3JAX_PAGE_PICTURES"):
+            page.screenshot(path=f"{pictures}/{env}-learning.png", full_page=True)
 
         # Arrow keys read a curve.
         plot = page.locator("#curves svg.plot").first

@@ -18,7 +18,15 @@ from rtd3jax.config import Config
 from rtd3jax.errors import UserError
 from rtd3jax.study.colours import colour_of, ordered
 from rtd3jax.study.plan import Cell
-from rtd3jax.study.results import CELL, CURVES, EPISODES, REFERENCES, number, read_table
+from rtd3jax.study.results import (
+    CELL,
+    CURVES,
+    EPISODES,
+    METRICS,
+    REFERENCES,
+    number,
+    read_table,
+)
 from rtd3jax.study.rundir import LOG, RunDirectory, lane_of, read_log, steps_reached
 from rtd3jax.study.statistics import Summary, iqm_bands, summarise
 
@@ -32,6 +40,7 @@ def study_data(
     directory: RunDirectory,
     curves: pd.DataFrame,
     episodes: pd.DataFrame,
+    metrics: pd.DataFrame,
     lanes: pd.DataFrame,
     notes: list[str],
 ) -> dict[str, Any]:
@@ -50,6 +59,7 @@ def study_data(
     )
     return {
         "title": directory.path.resolve().name,
+        "metrics": sorted(metrics["metric"].unique()),
         "measures": [[name, MEASURES[name]] for name in measures],
         "worlds": [
             {
@@ -76,6 +86,7 @@ def study_data(
                 "seeds": len(directory.seeds),
                 "begun": begun[tuple(cell.key[name] for name in CELL)],
                 "curves": {m: _curve(rows_of(curves, cell), m) for m in measures},
+                "learning": _learning(rows_of(metrics, cell)),
                 "final": {m: _final(rows_of(lanes, cell), m) for m in measures},
             }
             for cell in directory.cells
@@ -88,8 +99,10 @@ def study_data(
     }
 
 
-def tables_of(directory: RunDirectory, notes: list[str]) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """The learning curves and the final episodes; empty tables where there are none yet."""
+def tables_of(
+    directory: RunDirectory, notes: list[str]
+) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
+    """Learning curves, final episodes and metrics; empty tables where there are none yet."""
     tables = []
     for name, schema in (("curves", CURVES), ("episodes", EPISODES)):
         try:
@@ -98,7 +111,11 @@ def tables_of(directory: RunDirectory, notes: list[str]) -> tuple[pd.DataFrame, 
             reason = f"there is no {name}.parquet yet"
             notes.append(reason if "no results table" in str(error) else str(error))
             tables.append(schema.empty_table().to_pandas())
-    return tables[0], tables[1]
+    try:
+        tables.append(read_table(directory.path / "metrics.parquet", METRICS))
+    except UserError:  # runs of before there were metrics have no such table
+        tables.append(METRICS.empty_table().to_pandas())
+    return tables[0], tables[1], tables[2]
 
 
 def _with_log(
@@ -165,6 +182,22 @@ def _curve(rows: pd.DataFrame, measure: str) -> dict[str, Any] | None:
         "low": [number(value) for value in low],
         "high": [number(value) for value in high],
     }
+
+
+def _learning(rows: pd.DataFrame) -> dict[str, Any]:
+    """The mean over the seeds of each metric, at each evaluation at which it was measured."""
+    found = {}
+    for metric, here in rows.dropna(subset="value").groupby("metric"):
+        table = here.pivot(index="seed", columns="step", values="value")
+        nothing = [None] * table.shape[1]
+        found[metric] = {
+            "steps": [int(step) for step in table.columns],
+            "seeds": [int(seeds) for seeds in table.count()],
+            "iqm": [number(value) for value in table.mean()],
+            "low": nothing,
+            "high": nothing,
+        }
+    return found
 
 
 def _final(lanes: pd.DataFrame, measure: str) -> dict[str, Any] | None:

@@ -22,7 +22,18 @@ from rtd3jax.versions import versions_of
 
 NAME = "report.html"
 _GENERATOR = '<meta name="generator" content="rtd3jax">'
-_SCRIPTS = ("dom", "charts", "filters", "curves", "finals", "table", "transfer", "player", "main")
+_SCRIPTS = (
+    "dom",
+    "charts",
+    "filters",
+    "curves",
+    "learning",
+    "finals",
+    "table",
+    "transfer",
+    "player",
+    "main",
+)
 
 
 def write_page(
@@ -66,9 +77,9 @@ def refresh_page(directory: RunDirectory, *, complete: bool) -> None:
 def page_data(directory: RunDirectory, *, complete: bool, playback: bool) -> dict[str, Any]:
     """All that the page's code draws."""
     notes: list[str] = []
-    curves, episodes = tables_of(directory, notes)
+    curves, episodes, metrics = tables_of(directory, notes)
     lanes = seed_means(episodes)
-    data = study_data(directory, curves, episodes, lanes, notes)
+    data = study_data(directory, curves, episodes, metrics, lanes, notes)
     ceilings = ceilings_of(directory.path, directory.cells, compute=complete)
     for world in data["worlds"]:
         world["ceiling"] = ceilings.get((world["env"], world["disturbance"]))

@@ -57,8 +57,8 @@ function legendItems(panels) {
   return items;
 }
 
-function curvePanel({ world, length, cells, range }, width) {
-  const title = [worldName(world), length ? lengthName(length) : null].filter(Boolean).join(', ');
+function curvePanel({ world, length, cells, range, title: given }, width) {
+  const title = given ?? [worldName(world), length ? lengthName(length) : null].filter(Boolean).join(', ');
   const drawn = cells.filter((cell) => cell.curves[state.measure]);
   const figure = el('figure', {}, el('figcaption', {}, title));
   if (!drawn.length) {

@@ -55,6 +55,7 @@ function troubles() {
 function redraw() {
   tip.hide();
   drawCurves();
+  drawLearning();
   drawFinals();
   drawTable();
   drawTransfer();
@@ -63,6 +64,7 @@ function redraw() {
 colours();
 lede();
 startFilters(redraw);
+startLearning();
 redraw();
 startPlayback();
 drawStudy();

@@ -1,0 +1,38 @@
+// Metrics of learning, folded until they are asked for: a row of panels for each metric.
+
+function learningPanels() {
+  const panels = [];
+  for (const metric of DATA.metrics) {
+    DATA.worlds.forEach((world, index) => {
+      const cells = shownCells().filter((cell) => cell.world === index && cell.learning[metric]);
+      const lengths = [...new Set(cells.map((cell) => cell.length))].filter(Boolean).sort((a, b) => a - b);
+      for (const length of lengths.length ? lengths : [0]) {
+        const here = cells.filter((cell) => cell.length === 0 || cell.length === length)
+          .map((cell) => ({ ...cell, curves: { [state.measure]: cell.learning[metric] } }));
+        if (!here.length) continue;
+        const values = here.flatMap((cell) => cell.curves[state.measure].iqm);
+        const title = [metric.replaceAll('_', ' '), worldName(world), length ? lengthName(length) : null].filter(Boolean).join(', ');
+        panels.push({ world, length, cells: here, range: limits(values, []), title });
+      }
+    });
+  }
+  return panels;
+}
+
+function drawLearning() {
+  const section = byId('learning');
+  section.hidden = !DATA.metrics.length;
+  const fold = section.querySelector('details');
+  if (section.hidden || !fold.open) return;
+  const panels = learningPanels();
+  section.querySelector('.about').textContent =
+    'What was measured while the agents learned, averaged between evaluations: the mean over the seeds. ' +
+    'Actions count as saturated beyond 0.99 of their half range; the exploration return is that of the training episodes.';
+  const body = section.querySelector('.body');
+  if (panels.length) panelGrid(body, panels, 330, curvePanel);
+  else body.replaceChildren(el('p', { class: 'missing' }, 'Nothing is selected in the filter above.'));
+}
+
+function startLearning() {
+  byId('learning').querySelector('details').addEventListener('toggle', drawLearning);
+}
