@@ -45,7 +45,7 @@ def optimal_value(
 
 @functools.lru_cache(maxsize=2)
 def optimal_values(
-    params: PendulumParams, angles: int, speeds: int, steps: int
+    params: PendulumParams, angles: int, speeds: int, steps: int, kick: float = 0.0
 ) -> tuple[np.ndarray, float]:
     """The optimal return of each state with 0, 1, ..., ``steps`` - 1 steps to go.
 
@@ -54,13 +54,34 @@ def optimal_values(
         angles: as in `optimal_value`.
         speeds: likewise.
         steps: how many values to keep.
+        kick: standard deviation, rad, of a normal disturbance that moves the state after every
+            step along the upright pendulum's unstable direction: angle and speed together.
 
     Returns:
-        Values float32 [steps, angles, speeds + 1], and the top speed.
+        Values float32 [steps, angles, speeds + 1] of states before the kick, and the top speed.
     """
     improve, start, top = _backup(params, angles, speeds)
-    solve = jax.jit(lambda value: lax.scan(lambda v, _: (improve(v), v), value, length=steps)[1])
+
+    def step(value, _):
+        kicked = _kicked(value, params, kick, top) if kick else value
+        return improve(kicked), kicked
+
+    solve = jax.jit(lambda value: lax.scan(step, value, length=steps)[1])
     return np.asarray(solve(start)), top
+
+
+def _kicked(value: jax.Array, params: PendulumParams, kick: float, top: float) -> jax.Array:
+    """Mean of ``value`` after the kick, by Gauss and Hermite's rule of three points."""
+    angles, points = value.shape
+    angle = -math.pi + 2 * math.pi * jnp.arange(angles, dtype=jnp.float32) / angles
+    speed = jnp.linspace(-top, top, points, dtype=jnp.float32)
+    growth = math.sqrt(1.5 * params.g / params.l)  # per second, near upright
+
+    def moved(deviations: float) -> jax.Array:
+        far = jnp.clip(speed + deviations * kick * growth, -top, top)
+        return interpolate(value, (angle + deviations * kick)[:, None], far[None, :], top)
+
+    return moved(0.0) * (2 / 3) + (moved(math.sqrt(3)) + moved(-math.sqrt(3))) / 6
 
 
 def _backup(params: PendulumParams, angles: int, speeds: int):

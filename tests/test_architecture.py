@@ -19,6 +19,8 @@ LAYERS = {
     "deploy": 2,
     "policy": 3,
     "value_iteration": 3,
+    "pendulum_belief": 4,
+    "pendulum_filter": 5,
     "evaluate": 4,
     "saved": 4,
     "play_gymnasium": 4,
