@@ -19,6 +19,7 @@ from rtd3jax.envs.registry import DISTURBANCES, ENVIRONMENTS, make, register
 from rtd3jax.errors import UserError
 from rtd3jax.evaluate import evaluate
 from rtd3jax.load import load_policy
+from rtd3jax.pendulum_filter import filter_policy
 from rtd3jax.play_gymnasium import run_in_gymnasium
 from rtd3jax.policy import Policy, constant_policy, random_policy
 from rtd3jax.training.run import Failure, Run, train
@@ -59,6 +60,7 @@ __all__ = [
     "count_parameters",
     "disturb",
     "evaluate",
+    "filter_policy",
     "load_policy",
     "load_stablehlo",
     "find_problems",

@@ -5,7 +5,7 @@ myopic. The last action and the observation give the realised slip exactly; the 
 minimises the expected squared error under the conditional moments of the next slip.
 
 Pendulum: the fully observable optimum, by `rtd3jax.value_iteration`; it bounds every disturbed case
-from above.
+from above. `rtd3jax.pendulum_filter` has a policy that bounds some of them from below.
 """
 
 from typing import Any, NamedTuple
@@ -31,7 +31,7 @@ class Ceiling(NamedTuple):
 
     Attributes:
         mean: best possible mean return, or a bound from above.
-        standard_error: of ``mean``.
+        standard_error: of ``mean``; of an integral, which has no luck in it, the grid's error.
         kind: ``exact`` (the best policy's own return), or ``upper bound``.
     """
 
@@ -104,11 +104,17 @@ def bayes_policy(env: Any, model: Process | None = None) -> BayesPolicy:
 def ceiling(env: Any, episodes: int = 20_000, seed: int = 0) -> Ceiling:
     """The best possible mean return of ``env``, or an upper bound that is named as such.
 
+    Args:
+        env: a rover, or a pendulum, disturbed or not.
+        episodes: of the rover, how many random ones to average. The pendulum's ceiling is an
+            integral over all starts and needs none.
+        seed: of the rover's episodes.
+
     Raises:
         UserError: for a world whose ceiling is not known.
     """
     if isinstance(env, Pendulum | Disturbed):
-        return _pendulum_bound(env, episodes, seed)
+        return _pendulum_bound(env)
     if not isinstance(env, Rover):
         raise UserError("the ceiling is known for the rover and the pendulum alone")
     if isinstance(env.default_params.slip, SineSlip):
@@ -117,7 +123,7 @@ def ceiling(env: Any, episodes: int = 20_000, seed: int = 0) -> Ceiling:
     return Ceiling(float(returns.mean()), float(returns.std(ddof=1) / np.sqrt(episodes)), "exact")
 
 
-def _pendulum_bound(env: Any, episodes: int, seed: int) -> Ceiling:
+def _pendulum_bound(env: Any) -> Ceiling:
     """The undisturbed optimum: no disturbed pendulum can do better by its true state's reward."""
     params, disturbed = env.default_params, False
     if isinstance(env, Disturbed):
@@ -130,7 +136,7 @@ def _pendulum_bound(env: Any, episodes: int, seed: int) -> Ceiling:
             )
         disturbed = not (isinstance(params.process, Nothing) and isinstance(params.action, Nothing))
         params = params.env
-    mean, error = mean_optimal_return(params, episodes, seed)
+    mean, error = mean_optimal_return(params)
     return Ceiling(mean, error, "upper bound" if disturbed else "exact")
 
 

@@ -20,6 +20,8 @@ LAYERS = {
     "deploy": 4,
     "policy": 5,
     "value_iteration": 5,
+    "pendulum_belief": 6,
+    "pendulum_filter": 7,
     "evaluate": 6,
     "saved": 6,
     "play_gymnasium": 6,

@@ -47,7 +47,9 @@ def test_the_rover_experiment_runs_and_says_what_is_missing(tmp_path, capsys):
     assert (out / "rover_drive.gif").read_bytes().startswith(b"GIF")
 
 
-@pytest.mark.parametrize("name", ["slip_distributions", "parameter_counts", "sizing"])
+@pytest.mark.parametrize(
+    "name", ["slip_distributions", "parameter_counts", "sizing", "filter_reference"]
+)
 def test_small_experiments_run(name, tmp_path):
     load(EXPERIMENTS / f"{name}.py").main(["--quick", "--out", str(tmp_path)])
     assert (tmp_path / f"{name}.md").exists() and (tmp_path / f"{name}.parquet").exists()
