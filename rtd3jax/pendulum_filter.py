@@ -36,9 +36,8 @@ EXACT = 1e-3
 """Standard deviation that stands for none: above the rounding of float32 observations."""
 
 KICK = 0.08
-"""Standard deviation of the estimate's kick per step, rad for a unit of sigma. A steady Kalman
-filter of the upright pendulum has 0.10; 0.05 to 0.10 return the same within the standard error at
-sigma 0.5, and 0.07 did best at sigma 1."""
+"""Standard deviation of the estimate's kick per step, rad for a unit of sigma: a little less than a
+steady Kalman filter of the upright pendulum has."""
 
 GAUSSIANS = 24
 """The likeliest, over which the value is averaged."""
