@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT, describe, foreign_code
 from rtd3jax.errors import UserError
 from rtd3jax.programs import make_room
@@ -47,7 +48,7 @@ def both_returns(
     for name, value, low in (("episodes", episodes, 1), ("seed", seed, 0)):
         if isinstance(value, bool) or value != int(value) or not low <= value < 2**32:
             raise UserError(f"{name} must be an integer of at least {low}, not {value!r}")
-    params = env.default_params if params is None else params
+    params = parameters_of(env, params)
     interface = describe(env, params)
     expected = getattr(policy, "observation_size", interface.observation_size)
     if expected != interface.observation_size:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import (
     DEFAULT_STEP_LIMIT,
     Interface,
@@ -81,8 +82,10 @@ def check_env(env: Any, *, params: Any = None, seed: int = 0) -> None:
 
 def find_problems(env: Any, *, params: Any = None, seed: int = 0) -> list[Finding]:
     """What `check_env` would raise, as a list; empty for a sound environment."""
-    if params is None:
-        params = getattr(env, "default_params", None)
+    try:
+        params = parameters_of(env, params)
+    except UserError as error:
+        return [Finding("interface", str(error), "")]
     found = survey(env, params)
     findings = [Finding("interface", str(error), "") for error in found.problems]
     if found.reset is None or found.step is None:

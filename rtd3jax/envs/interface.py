@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rtd3jax.envs.entry import check_gymnax
 from rtd3jax.errors import UserError
 
 DEFAULT_STEP_LIMIT = 10_000
@@ -63,14 +64,10 @@ def describe(env: Any, params: Any) -> Interface:
 def survey(env: Any, params: Any) -> Survey:
     """All that `describe` can find wrong, and the shapes that it saw."""
     name = environment_name(env)
-    for method in ("reset", "step", "action_space"):
-        if not callable(getattr(env, method, None)):
-            error = UserError(
-                f"environment {name} has no method {method}: it is not a gymnax environment "
-                "(gymnax >= 1.0: reset(key, params), step(key, state, action, params), "
-                "action_space(params))"
-            )
-            return Survey(None, [error], None, None)
+    try:
+        check_gymnax(env)
+    except UserError as error:
+        return Survey(None, [error], None, None)
     problems: list[UserError] = []
 
     def noted(call: Callable[[], Any]) -> Any:

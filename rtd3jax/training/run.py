@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from rtd3jax.config import Config
+from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
 from rtd3jax.policy import Policy
@@ -151,7 +152,7 @@ def make_jobs(
 
     With ``window``, jobs of shorter history lengths share the program of that length.
     """
-    params = env.default_params if params is None else params
+    params = parameters_of(env, params)
     interface = describe(env, params)
     program = make_program(env, config, interface.observation_size, interface.action_shape, window)
     return [Job(program, make_lane(config, seed, params), (cell, seed)) for seed in seeds]
