@@ -17,6 +17,7 @@ LAYERS = {
     "envs": 2,
     "agents": 2,
     "deploy": 2,
+    "fit": 3,
     "policy": 3,
     "value_iteration": 3,
     "evaluate": 4,
