@@ -31,6 +31,7 @@ from rtd3jax.training.loop import (
     make_program,
 )
 from rtd3jax.training.progress import Progress
+from rtd3jax.training.worth import warn_if_untrained
 
 _REASONS = {
     ENVIRONMENT_NOT_FINITE: "the environment gave an observation or reward that is not finite; "
@@ -153,6 +154,7 @@ def make_jobs(
     With ``window``, jobs of shorter history lengths share the program of that length.
     """
     params = parameters_of(env, params)
+    warn_if_untrained(config)
     interface = describe(env, params)
     program = make_program(env, config, interface.observation_size, interface.action_shape, window)
     return [Job(program, make_lane(config, seed, params), (cell, seed)) for seed in seeds]
