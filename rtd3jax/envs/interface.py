@@ -15,6 +15,9 @@ from rtd3jax.errors import UserError
 DEFAULT_STEP_LIMIT = 10_000
 """Steps after which an episode is cut where the environment names no time limit of its own."""
 
+MOST_BOUND = 1e20
+"""An action's bound from here on means "no limit": its square is beyond float32."""
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Interface:
@@ -175,6 +178,15 @@ def _bounds(env: Any, params: Any, name: str) -> tuple[tuple[int, ...], np.ndarr
     if not (np.all(np.isfinite(low)) and np.all(np.isfinite(high))):
         raise UserError(
             f"environment {name}: the action space is unbounded; give its Box finite low and high"
+        )
+    largest = max(np.max(np.abs(low), initial=0.0), np.max(np.abs(high), initial=0.0))
+    with np.errstate(over="ignore"):
+        countable = bool(np.all(np.isfinite(high - low)))
+    if largest >= MOST_BOUND or not countable:
+        raise UserError(
+            f"environment {name}: the action's bounds reach {largest:.3g}, with which float32 "
+            "cannot calculate; where that stands for 'no limit', give the Box the range that the "
+            "plant can use"
         )
     if low.size == 0 or not np.all(low < high):
         raise UserError(f"environment {name}: the action space needs low < high in every element")

@@ -189,6 +189,21 @@ def test_unbounded_actions(bound):
     refused(Unbounded(), "unbounded")
 
 
+@pytest.mark.parametrize("bound", [np.finfo(np.float32).max, 3e38, 1e20])
+def test_bounds_that_mean_no_limit(bound):
+    class NoLimit(Good):
+        space = spaces.Box(-bound, bound, (1,))
+
+    assert "the range that the plant can use" in refused(NoLimit(), "bounds reach")
+
+
+def test_large_bounds_are_bounds():
+    class Large(Good):
+        space = spaces.Box(-9e19, 9e19, (1,))
+
+    describe(Large(), Large().default_params)
+
+
 def test_empty_range_of_actions():
     class Empty(Good):
         space = spaces.Box(1.0, 1.0, (1,))
