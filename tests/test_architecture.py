@@ -11,6 +11,7 @@ ROOT = pathlib.Path(rtd3jax.__file__).parent
 LAYERS = {
     "errors": 0,
     "files": 1,
+    "machine": 1,
     "programs": 1,
     "versions": 1,
     "config": 1,
