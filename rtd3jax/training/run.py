@@ -12,6 +12,7 @@ from rtd3jax.config import Config
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
+from rtd3jax.files import user_path
 from rtd3jax.policy import Policy
 from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.lanes import (
@@ -120,7 +121,7 @@ def train(
     label = f"{config.algorithm} l={config.history_length}"
     checkpoints = None
     if checkpoint_dir is not None:
-        checkpoints = _checkpoints(Path(checkpoint_dir), config, env, checkpoint_seconds)
+        checkpoints = _checkpoints(user_path(checkpoint_dir), config, env, checkpoint_seconds)
     with Progress(groups, lambda job: label, enabled=progress) as bar:
         advance_groups(groups, bar.update, checkpoints)
     if checkpoints is not None:

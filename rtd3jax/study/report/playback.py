@@ -235,7 +235,7 @@ def _middle_seed(directory: RunDirectory, cell: Cell, lanes: pd.DataFrame) -> in
 
 def _read(path: Path, stamp: dict[str, Any]) -> dict[str, Any] | None:
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text("utf-8"))
         if all(content[name] == value for name, value in stamp.items()) and content["runs"]:
             return content
     except (OSError, ValueError, KeyError, TypeError):
