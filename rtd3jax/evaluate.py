@@ -6,8 +6,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT, describe, foreign_code
 from rtd3jax.errors import UserError
+from rtd3jax.fit import check_fit
 from rtd3jax.programs import make_room
 
 
@@ -47,20 +49,15 @@ def both_returns(
     for name, value, low in (("episodes", episodes, 1), ("seed", seed, 0)):
         if isinstance(value, bool) or value != int(value) or not low <= value < 2**32:
             raise UserError(f"{name} must be an integer of at least {low}, not {value!r}")
-    params = env.default_params if params is None else params
+    params = parameters_of(env, params)
     interface = describe(env, params)
-    expected = getattr(policy, "observation_size", interface.observation_size)
-    if expected != interface.observation_size:
-        raise UserError(
-            f"the policy expects {expected} observation elements, the environment gives "
-            f"{interface.observation_size}: evaluate it on the kind of world it was trained on"
-        )
-    action = getattr(policy, "action", None)
-    if action is not None and action.shape != (interface.action_size,):
-        raise UserError(
-            f"the constant action has {action.size} elements, "
-            f"the environment's has {interface.action_size}"
-        )
+    check_fit(
+        policy,
+        interface.observation_size,
+        interface.action_shape,
+        interface.action_low,
+        interface.action_high,
+    )
     make_room()
     key = jax.random.key(int(seed))
     return _episode_returns(policy, env, params, key, int(episodes))

@@ -3,13 +3,13 @@
 import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 from rtd3jax.deploy.formats import FORMATS
-from rtd3jax.errors import UserError
+from rtd3jax.files import user_path
 from rtd3jax.load import load_policy
 from rtd3jax.policy import Policy
 from rtd3jax.registries import AGENTS
+from rtd3jax.study.command import exit_status, import_worlds, run_parser
 
 POLICY = "policy"
 """The form that `rtd3jax.load_policy` reads."""
@@ -18,23 +18,24 @@ POLICY = "policy"
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; the exit status: 0 done, 2 bad input."""
     options = _parser().parse_args(arguments)
-    try:
-        policy = load_policy(
-            options.run,
-            algorithm=options.agent,
-            seed=options.seed,
-            env=options.env,
-            disturbance=options.disturbance,
-            history_length=options.history_length,
-        )
-        path = Path(options.out or _default_name(policy, options))
-        if options.format == POLICY:
-            policy.save(path, overwrite=options.force)
-        else:
-            policy.export(path, options.format, overwrite=options.force)
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    return exit_status(lambda: _run(options), lambda: options.run)
+
+
+def _run(options: argparse.Namespace) -> int:
+    import_worlds(options.imports)
+    policy = load_policy(
+        options.run,
+        algorithm=options.agent,
+        seed=options.seed,
+        env=options.env,
+        disturbance=options.disturbance,
+        history_length=options.history_length,
+    )
+    path = user_path(options.out or _default_name(policy, options))
+    if options.format == POLICY:
+        policy.save(path, overwrite=options.force)
+    else:
+        policy.export(path, options.format, overwrite=options.force)
     print(
         f"{path}: {policy.algorithm} l={int(policy.history_length)}, "
         f"{policy.observation_size} observation elements, actions of shape {policy.action_shape}, "
@@ -45,22 +46,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _default_name(policy: Policy, options: argparse.Namespace) -> str:
     suffix = ".safetensors" if options.format == POLICY else FORMATS[options.format][0]
-    if Path(options.run).is_dir():
+    if user_path(options.run).is_dir():
         stem = f"{policy.algorithm}_l{int(policy.history_length)}_seed-{options.seed or 0}"
         # A module's name must be an identifier to be imported by name.
         return (stem.replace("-", "_") if suffix == ".py" else stem) + suffix
-    return str(Path(options.run).with_suffix(suffix))
+    return str(user_path(options.run).with_suffix(suffix))
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m rtd3jax.export",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog="example:\n"
-        "  python -m rtd3jax.export runs/quick --agent h-td3 --seed 0 --format onnx",
-    )
-    parser.add_argument("run", help="a run directory, or a file that policy.save wrote")
+    example = "runs/quick --agent h-td3 --seed 0 --format onnx"
+    what = "a run directory, or a file that policy.save wrote"
+    parser = run_parser("export", __doc__, example, what)
     parser.add_argument(
         "--format", required=True, choices=(*FORMATS, POLICY), help="the form of the file"
     )

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import os
-import tempfile
+import secrets
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,16 +12,31 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from rtd3jax.errors import UserError
+from rtd3jax.errors import UserError, first_line
 
 _ENTRY = "rtd3jax"
 
 
+def user_path(path: str | os.PathLike) -> Path:
+    """``path`` with ``~`` and ``~name`` expanded: a shell does not do so after ``--out=``.
+
+    Raises:
+        UserError: when there is no such home directory.
+    """
+    try:
+        return Path(path).expanduser()
+    except RuntimeError as error:
+        raise UserError(f"{path}: {first_line(error)}; write the whole path") from error
+
+
 def write_bytes_atomically(path: str | os.PathLike, data: bytes) -> None:
     """Put ``data`` at ``path``; a crash at any moment leaves either the old file or the new one."""
-    path = Path(path)
+    path = user_path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
+    # Opened as any file is, so that the umask and the directory's rules say who may read it.
+    name = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
+    handle = os.open(name, flags, 0o666)
     try:
         with os.fdopen(handle, "wb") as file:
             file.write(data)
@@ -29,7 +44,7 @@ def write_bytes_atomically(path: str | os.PathLike, data: bytes) -> None:
             os.fsync(file.fileno())
         os.replace(name, path)
     except BaseException:
-        Path(name).unlink(missing_ok=True)
+        name.unlink(missing_ok=True)
         raise
 
 
@@ -39,10 +54,14 @@ def check_target(path: str | os.PathLike, overwrite: bool = False) -> Path:
     Raises:
         UserError: when it is a directory, or exists and is not to be replaced.
     """
-    path = Path(path)
-    if path.is_dir():
+    path = user_path(path)
+    try:
+        is_directory, exists = path.is_dir(), path.exists()
+    except OSError as error:
+        raise UserError(f"{path} cannot be written ({error.strerror})") from error
+    if is_directory:
         raise UserError(f"{path} is a directory; name a file in it")
-    if path.exists() and not overwrite:
+    if exists and not overwrite:
         raise UserError(f"{path} exists; say overwrite=True (--force) to replace it")
     return path
 
@@ -81,13 +100,18 @@ def read_arrays(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], Any]:
     Raises:
         UserError: when the file is missing, truncated, altered, or something else.
     """
+    path = user_path(path)
     try:
+        # safetensors says "No such file" whatever the reason, and the system says the true one.
+        path.open("rb").close()
         with safe_open(path, "numpy") as file:
             entry = json.loads((file.metadata() or {})[_ENTRY])
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         about, digest = entry["about"], entry["sha256"]
-    except (OSError, SafetensorError, KeyError, ValueError, TypeError) as error:
-        raise UserError(f"{path} cannot be read ({str(error).splitlines()[0]})") from error
+    except OSError as error:
+        raise UserError(f"{path} cannot be read ({error.strerror or first_line(error)})") from error
+    except (SafetensorError, KeyError, ValueError, TypeError) as error:
+        raise UserError(f"{path} cannot be read ({first_line(error)})") from error
     if digest != _digest(arrays, about):
         raise UserError(f"{path} is damaged: its checksum does not agree")
     return arrays, about

@@ -1,10 +1,10 @@
 """`load_policy`: a trained policy from a file, or from the directory of a sweep."""
 
 import os
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rtd3jax.errors import UserError
+from rtd3jax.files import user_path
 from rtd3jax.policy import Policy
 from rtd3jax.saved import read_policy
 
@@ -45,7 +45,12 @@ def load_policy(
         "seed": seed,
     }
     given = {name: value for name, value in given.items() if value is not None}
-    if not Path(path).is_dir():
+    path = user_path(path)
+    try:
+        is_directory = path.is_dir()
+    except OSError as error:
+        raise UserError(f"{path} cannot be read ({error.strerror})") from error
+    if not is_directory:
         if given:
             raise UserError(
                 f"{path} is not a run directory, among whose lanes {', '.join(given)} would choose"
@@ -54,7 +59,7 @@ def load_policy(
     # Here, because it brings the libraries for tables and pictures, which playing does not need.
     from rtd3jax.study.rundir import RunDirectory
 
-    directory = RunDirectory.open(Path(path))
+    directory = RunDirectory.open(path)
     seed = given.pop("seed", 0)
     cell = _choose(directory, given)
     if seed not in directory.seeds:

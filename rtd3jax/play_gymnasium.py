@@ -8,6 +8,7 @@ import numpy as np
 
 from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT
 from rtd3jax.errors import UserError
+from rtd3jax.fit import check_fit
 
 
 def run_in_gymnasium(policy: Any, gym_env: Any, episodes: int = 10, seed: int = 0) -> np.ndarray:
@@ -80,15 +81,8 @@ def _check_fit(policy: Any, env: Any) -> gymnasium.spaces.Box:
             f"the environment's observations are {observations}; a policy needs a flat Box: "
             "wrap it in gymnasium.wrappers.FlattenObservation"
         )
-    expected = getattr(policy, "observation_size", observations.shape[0])
-    if expected != observations.shape[0]:
-        raise UserError(
-            f"the policy expects {expected} observation elements, "
-            f"the environment gives {observations.shape[0]}"
-        )
+    check_fit(policy, observations.shape[0], actions.shape, actions.low, actions.high)
     kind = type(policy).__name__
-    if not (callable(getattr(policy, "init", None)) and callable(getattr(policy, "step", None))):
-        raise UserError(f"{kind} is not a policy: it needs init and step")
     seen = jax.ShapeDtypeStruct(observations.shape, np.float32)
     try:
         shape = jax.eval_shape(_act, policy, jax.eval_shape(policy.init), seen)[0].shape

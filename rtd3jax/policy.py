@@ -19,6 +19,7 @@ from rtd3jax.agents.memory.base import Params
 from rtd3jax.agents.networks import Network, act
 from rtd3jax.deploy.formats import writer_of
 from rtd3jax.deploy.model import Model, fold
+from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
 from rtd3jax.files import array_bytes, check_target, flatten, write_new
@@ -237,6 +238,6 @@ def constant_policy(action: Any) -> ConstantPolicy:
 
 def random_policy(env: Any, params: Any = None) -> RandomPolicy:
     """The uniform-random policy of ``env``: the floor of every table."""
-    interface = describe(env, env.default_params if params is None else params)
+    interface = describe(env, parameters_of(env, params))
     bounds = Bounds(jnp.asarray(interface.action_low), jnp.asarray(interface.action_high))
     return RandomPolicy(bounds, interface.action_shape)

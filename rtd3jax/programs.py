@@ -54,7 +54,7 @@ def make_room() -> bool:
 def _mappings() -> tuple[int, float]:
     """How many the process has, and how many it may have."""
     with contextlib.suppress(OSError, ValueError):
-        limit = int(_LIMIT.read_text())
+        limit = int(_LIMIT.read_text("utf-8"))
         with _MAPS.open("rb") as lines:
             return sum(1 for _ in lines), float(limit)
     return 0, float("inf")

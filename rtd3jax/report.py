@@ -6,8 +6,8 @@ A sweep writes it too; this command writes it again, from another version or for
 import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
+from rtd3jax.files import user_path
 from rtd3jax.study.command import exit_status, import_worlds, run_parser
 from rtd3jax.study.report.page import NAME, write_page
 from rtd3jax.study.rundir import RunDirectory
@@ -22,7 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> int:
     import_worlds(options.imports)
     directory = RunDirectory.open(options.run)
-    out = None if options.out is None else Path(options.out)
+    out = None if options.out is None else user_path(options.out)
     path = write_page(directory, out, playback=options.playback)
     print(f"{path}: {path.stat().st_size / 2**20:.1f} MiB")
     return 0

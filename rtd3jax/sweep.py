@@ -140,7 +140,7 @@ def _train(
     directory.derive(references)
     if options.report:
         refresh_page(directory, complete=complete)
-    print((directory.path / "summary.md").read_text())
+    print((directory.path / "summary.md").read_text("utf-8"))
     print(f"results: {directory.path}")
     if interrupted:
         print("interrupted: the same command goes on with the lanes that are missing")

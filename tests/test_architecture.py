@@ -11,6 +11,7 @@ ROOT = pathlib.Path(rtd3jax.__file__).parent
 LAYERS = {
     "errors": 0,
     "files": 1,
+    "machine": 1,
     "programs": 1,
     "versions": 1,
     "registries": 1,
@@ -18,6 +19,7 @@ LAYERS = {
     "envs": 3,
     "agents": 3,
     "deploy": 4,
+    "fit": 5,
     "policy": 5,
     "value_iteration": 5,
     "pendulum_belief": 6,

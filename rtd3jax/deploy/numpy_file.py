@@ -16,7 +16,7 @@ def numpy_bytes(model: Model) -> bytes:
     raw = b"".join(array.astype("<f4").tobytes() for array in model.arrays.values())
     about = repr({**model.header(), "arrays": shapes})
     text = base64.encodebytes(raw).decode()
-    source = importlib.resources.files("rtd3jax.deploy").joinpath("player.py").read_text()
+    source = importlib.resources.files("rtd3jax.deploy").joinpath("player.py").read_text("utf-8")
     assert source.count(_ABOUT) == 1 and source.count(_WEIGHTS) == 1
     source = source.replace(_ABOUT, f"ABOUT: dict[str, Any] = {about}\n")
     # Last, so that no text of the header can be taken for the mark.

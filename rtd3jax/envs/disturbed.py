@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 from gymnax.environments import environment, spaces
 
+from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.identity import ValueIdentity, strong
 from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT, describe, foreign_code
 from rtd3jax.envs.process import Chain, Nothing, Process
@@ -236,13 +237,13 @@ def disturb(env: Any, process: Process, channel: str = "observation", *, params:
             "or inherit from rtd.Process"
         )
     process.validate()
+    params = parameters_of(env, params)
     for method in ("reset_env", "step_env", "is_truncated"):
         if not callable(getattr(env, method, None)):
             raise UserError(
                 f"{type(env).__name__} has no {method}, without which a disturbance cannot be "
                 "composed with its episodes: inherit from gymnax's Environment"
             )
-    params = env.default_params if params is None else params
     if not isinstance(env, Disturbed):
         describe(env, params)
         env, params = Disturbed(env), DisturbedParams(env=params)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from gymnax.environments import spaces
 
+from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import (
     check_final_observation,
     environment_name,
@@ -37,7 +38,7 @@ class GymnasiumEnv(gymnasium.Env):
 
     def __init__(self, env: Any, params: Any = None) -> None:
         self.world = env
-        self.params = env.default_params if params is None else params
+        self.params = parameters_of(env, params)
         self.action_space, self.observation_space = _spaces(env, self.params)
         self._key: Any = None
         self._state: Any = None
@@ -113,9 +114,6 @@ def register_with_gymnasium() -> None:
 def _spaces(env: Any, params: Any) -> tuple[gymnasium.Space, gymnasium.Space]:
     """Spaces of actions and observations; UserError for what is no gymnax >= 1.0 environment."""
     name = environment_name(env)
-    for method in ("reset", "step", "action_space"):
-        if not callable(getattr(env, method, None)):
-            raise UserError(f"environment {name} has no method {method}: it is not a gymnax one")
     with foreign_code():
         actions = _gymnasium_space(name, "action", env.action_space(params))
     observation, state = trace_reset(env, params)

@@ -9,10 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rtd3jax.envs.entry import check_gymnax
 from rtd3jax.errors import UserError
 
 DEFAULT_STEP_LIMIT = 10_000
 """Steps after which an episode is cut where the environment names no time limit of its own."""
+
+MOST_BOUND = 1e20
+"""An action's bound from here on means "no limit": its square is beyond float32."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -68,14 +72,10 @@ def describe(env: Any, params: Any) -> Interface:
 def survey(env: Any, params: Any) -> Survey:
     """All that `describe` can find wrong, and the shapes that it saw."""
     name = environment_name(env)
-    for method in ("reset", "step", "action_space"):
-        if not callable(getattr(env, method, None)):
-            error = UserError(
-                f"environment {name} has no method {method}: it is not a gymnax environment "
-                "(gymnax >= 1.0: reset(key, params), step(key, state, action, params), "
-                "action_space(params))"
-            )
-            return Survey(None, [error], None, None)
+    try:
+        check_gymnax(env)
+    except UserError as error:
+        return Survey(None, [error], None, None)
     problems: list[UserError] = []
 
     def noted(call: Callable[[], Any]) -> Any:
@@ -183,6 +183,15 @@ def _bounds(env: Any, params: Any, name: str) -> tuple[tuple[int, ...], np.ndarr
     if not (np.all(np.isfinite(low)) and np.all(np.isfinite(high))):
         raise UserError(
             f"environment {name}: the action space is unbounded; give its Box finite low and high"
+        )
+    largest = max(np.max(np.abs(low), initial=0.0), np.max(np.abs(high), initial=0.0))
+    with np.errstate(over="ignore"):
+        countable = bool(np.all(np.isfinite(high - low)))
+    if largest >= MOST_BOUND or not countable:
+        raise UserError(
+            f"environment {name}: the action's bounds reach {largest:.3g}, with which float32 "
+            "cannot calculate; where that stands for 'no limit', give the Box the range that the "
+            "plant can use"
         )
     if low.size == 0 or not np.all(low < high):
         raise UserError(f"environment {name}: the action space needs low < high in every element")

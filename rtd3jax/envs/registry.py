@@ -19,6 +19,7 @@ from rtd3jax.envs.disturbed import (
     disturb,
     sequence,
 )
+from rtd3jax.envs.entry import check_gymnax
 from rtd3jax.envs.faults import Delay, Dropout, GainDrift, OrnsteinUhlenbeck, Quantisation
 from rtd3jax.envs.identity import ValueIdentity, strong, with_identity
 from rtd3jax.envs.interface import foreign_code
@@ -131,6 +132,7 @@ def register(
     if env_id in {*_constructors, *_registered, *_PROCESSES} or env_id in gymnax.registered_envs:
         raise UserError(f"environment {env_id!r} exists already; choose another id")
     if is_environment:
+        check_gymnax(world)
         _registered[env_id] = world, _named_processes(env_id, world, disturbances or {})
     elif disturbances is not None:
         raise UserError(f"{env_id!r}: disturbances are for an environment, not for a function")

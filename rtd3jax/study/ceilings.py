@@ -58,7 +58,7 @@ def _entry(best: Ceiling) -> dict[str, Any]:
 
 def _read(path: Path, version: str) -> dict[str, dict[str, Any]]:
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text("utf-8"))
         if content["rtd3jax"] == version:
             return {
                 name: entry

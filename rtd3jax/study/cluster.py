@@ -192,7 +192,7 @@ def _check_nodes(
     mine = versions_of(PACKAGES)
     token = uuid.uuid4().hex
     mark = directory.path / f".cluster-{token}"
-    mark.write_text(token)
+    mark.write_text(token, "utf-8")
     try:
         probe = ray.remote(_probe)
         asked = {}
@@ -235,7 +235,7 @@ def _probe(mark: str, imports: list[str]) -> tuple[dict[str, str], str | None, s
     except UserError as error:
         problem = str(error)
     path = Path(mark)
-    return versions_of(PACKAGES), path.read_text() if path.exists() else None, problem
+    return versions_of(PACKAGES), path.read_text("utf-8") if path.exists() else None, problem
 
 
 def _train_cell(
@@ -315,7 +315,7 @@ def _outcome(ray: Any, task: Any, directory: RunDirectory, jobs: Sequence[Job]) 
     """Complaints of a task that ended; one that died leaves its reason with its lanes."""
     try:
         complaints, report = ray.get(task)
-        with (directory.path / TASKS).open("a") as file:
+        with (directory.path / TASKS).open("a", encoding="utf-8") as file:
             file.write(json.dumps(report) + "\n")
         return complaints
     except Exception as error:

@@ -2,12 +2,20 @@
 
 import argparse
 import importlib
+import io
 import os
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from rtd3jax.errors import UserError
+
+
+def show_what_can_be_shown() -> None:
+    """Let a terminal that lacks a letter show "?" in its place: output must not end a training."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
 
 
 def exit_status(work: Callable[[], int], place: Callable[[], Any]) -> int:
@@ -21,7 +29,7 @@ def exit_status(work: Callable[[], int], place: Callable[[], Any]) -> int:
         print(f"error: {error}", file=sys.stderr)
     except OSError as error:
         # A full disk, say. What was written before is whole, and the same command goes on from it.
-        print(f"error: {error.filename or place()}: {error.strerror}", file=sys.stderr)
+        print(f"error: {error.filename or place()}: {error.strerror or error}", file=sys.stderr)
     return 2
 
 
@@ -37,15 +45,18 @@ def add_import(group: Any) -> None:
     )
 
 
-def run_parser(name: str, description: str | None, example: str) -> argparse.ArgumentParser:
+def run_parser(
+    name: str, description: str | None, example: str, what: str = "a run directory"
+) -> argparse.ArgumentParser:
     """The parser of a command on a run directory, with ``run`` and ``--import``."""
+    show_what_can_be_shown()
     parser = argparse.ArgumentParser(
         prog=f"python -m rtd3jax.{name}",
         description=description,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog=f"example:\n  python -m rtd3jax.{name} {example}",
     )
-    parser.add_argument("run", help="a run directory")
+    parser.add_argument("run", help=what)
     add_import(parser)
     return parser
 

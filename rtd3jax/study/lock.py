@@ -1,17 +1,18 @@
 """One writer for a run directory, or one for each shard of it; one at a time for its tables.
 
-The lock is the operating system's (flock): it goes when its process goes, however that ends.
+The lock is the operating system's: it goes when its process goes, however that ends.
 """
 
 import contextlib
-import fcntl
 import os
 import re
 import time
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
 from rtd3jax.errors import UserError
+from rtd3jax.study.filelock import lock, open_for_locking
 
 
 def parse_shard(text: str) -> tuple[int, int]:
@@ -32,12 +33,12 @@ def writer(directory: Path, shard: tuple[int, int] | None) -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         whole = "another process is writing to it"
         if shard is None:
-            _hold(stack, directory, directory / ".lock", fcntl.LOCK_EX, whole)
+            _hold(stack, directory, directory / ".lock", False, whole)
         else:
-            _hold(stack, directory, directory / ".lock", fcntl.LOCK_SH, whole)
+            _hold(stack, directory, directory / ".lock", True, whole)
             name = f".lock-{shard[0]}-of-{shard[1]}"
             taken = f"another process is writing shard {shard[0]}/{shard[1]} of it"
-            _hold(stack, directory, directory / name, fcntl.LOCK_EX, taken)
+            _hold(stack, directory, directory / name, False, taken)
         yield
 
 
@@ -47,18 +48,20 @@ def deriver(directory: Path) -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         handle = _open(directory, directory / ".lock-tables")
         stack.callback(os.close, handle)
-        fcntl.flock(handle, fcntl.LOCK_EX)
+        lock(handle, wait=True)
         yield
 
 
 def is_held(directory: Path) -> bool:
     """Whether a process is writing to the directory now."""
     try:
-        handle = os.open(directory / ".lock", os.O_RDONLY | os.O_NOFOLLOW)
+        handle = open_for_locking(directory / ".lock", create=False)
     except OSError:
         return False
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # where there are no locks, none is held
+            lock(handle)
     except BlockingIOError:
         return True
     else:
@@ -67,12 +70,14 @@ def is_held(directory: Path) -> bool:
         os.close(handle)
 
 
-def _hold(stack: contextlib.ExitStack, directory: Path, path: Path, kind: int, reason: str) -> None:
+def _hold(
+    stack: contextlib.ExitStack, directory: Path, path: Path, shared: bool, reason: str
+) -> None:
     handle = _open(directory, path)
     stack.callback(os.close, handle)
     for patience in (0.1, 0.2, None):  # --status looks at a lock by holding it for a moment
         try:
-            fcntl.flock(handle, kind | fcntl.LOCK_NB)
+            lock(handle, shared=shared)
             return
         except BlockingIOError as error:
             if patience is None:
@@ -84,6 +89,6 @@ def _hold(stack: contextlib.ExitStack, directory: Path, path: Path, kind: int, r
 
 def _open(directory: Path, path: Path) -> int:
     try:
-        return os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+        return open_for_locking(path)
     except OSError as error:
         raise UserError(f"--out {directory} cannot be written: {error.strerror}") from error

@@ -1,6 +1,5 @@
 """What lanes need in memory, before anything is allocated, and how many fit at once."""
 
-import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,6 +8,7 @@ import jax
 from rtd3jax.agents.agent import count_parameters
 from rtd3jax.config import Config
 from rtd3jax.errors import UserError
+from rtd3jax.machine import memory_limit
 from rtd3jax.registries import AGENTS
 from rtd3jax.training.lanes import Job, workers
 
@@ -89,6 +89,6 @@ def lanes_at_once(jobs: Sequence[Job], strategy: str, workers: int, memory: int)
 
 
 def memory() -> int:
-    """Bytes of the device's own memory, or of the machine's."""
+    """Bytes of the device's own memory, or of what this process may use of the machine's."""
     limit = (workers()[0].memory_stats() or {}).get("bytes_limit")
-    return limit or os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return limit or memory_limit()

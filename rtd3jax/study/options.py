@@ -13,8 +13,9 @@ from rtd3jax.agents.variants import ALGORITHMS
 from rtd3jax.config import Config
 from rtd3jax.envs.registry import DISTURBANCES, ENVIRONMENTS
 from rtd3jax.errors import UserError
+from rtd3jax.files import user_path
 from rtd3jax.registries import AGENTS
-from rtd3jax.study.command import add_import
+from rtd3jax.study.command import add_import, show_what_can_be_shown
 from rtd3jax.study.loggers import LOGGERS
 from rtd3jax.study.plan import Grid
 from rtd3jax.study.presets import PRESETS
@@ -29,6 +30,7 @@ class _Parser(argparse.ArgumentParser):
 
 def parser(description: str | None) -> argparse.ArgumentParser:
     """The command line of ``rtd3jax.sweep``; bad input raises `UserError`."""
+    show_what_can_be_shown()
     worlds = "\n".join(f"  {env}: {', '.join(DISTURBANCES[env])}" for env in ENVIRONMENTS)
     found = _Parser(
         prog="python -m rtd3jax.sweep",
@@ -142,7 +144,7 @@ def out(options: argparse.Namespace) -> Path:
     """The run directory."""
     if not (options.out or options.preset or options.env):
         raise UserError("say where: --out DIR")
-    return Path(options.out or Path("runs") / (options.preset or options.env))
+    return user_path(options.out or Path("runs") / (options.preset or options.env))
 
 
 def count(name: str, value: int, most: int = 100_000) -> int:

@@ -58,7 +58,7 @@ class Recorder:
 
     def _log(self, group: Group) -> None:
         assert group.returns is not None and group.metrics is not None
-        with (self._directory.path / LOG).open("a") as log:
+        with (self._directory.path / LOG).open("a", encoding="utf-8") as log:
             for index, job in enumerate(group.jobs):
                 cell, seed = job.owner
                 curve, steps = group.returns[index], evaluation_steps(cell.config)

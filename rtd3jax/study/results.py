@@ -9,7 +9,6 @@ import io
 import math
 import os
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from rtd3jax.errors import UserError
-from rtd3jax.files import write_bytes_atomically
+from rtd3jax.files import user_path, write_bytes_atomically
 
 # Untrained policies evaluated for comparison. Their EPISODES rows carry history_length 0 and a
 # negative seed, because neither has a meaning for them.
@@ -103,7 +102,8 @@ def read_table(path: str | os.PathLike, schema: pa.Schema | None = None) -> pd.D
     Without ``schema`` the file may be any of this module's tables. Raises ``UserError`` when the
     file is missing, cannot be read as Parquet, or has other columns than expected.
     """
-    if not Path(path).is_file():
+    path = user_path(path)
+    if not path.is_file():
         raise UserError(f"no results table at {path}")
     try:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:

@@ -18,7 +18,7 @@ import numpy as np
 
 from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
-from rtd3jax.files import flatten, read_arrays, write_arrays, write_bytes_atomically
+from rtd3jax.files import flatten, read_arrays, user_path, write_arrays, write_bytes_atomically
 from rtd3jax.policy import FORMAT, Policy
 from rtd3jax.saved import restore_policy
 from rtd3jax.study.ceilings import ceilings_of
@@ -72,7 +72,7 @@ class RunDirectory:
         *,
         prepare: bool = True,
     ):
-        self.path = Path(path)
+        self.path = user_path(path)
         self.cells = list(cells)
         self.seeds = list(seeds)
         self.episodes = episodes
@@ -87,7 +87,7 @@ class RunDirectory:
     @classmethod
     def open(cls, path: str | Path) -> "RunDirectory":
         """The study that is in ``path`` already."""
-        study = _read_study(Path(path) / "config.json")
+        study = _read_study(user_path(path) / "config.json")
         try:
             cells = [Cell.from_dict(dict(cell)) for cell in study["cells"]]
             seeds, episodes = check_seeds(study["seeds"]), int(study["final_episodes"])
@@ -123,7 +123,7 @@ class RunDirectory:
 
     def _check_format(self, config: Path) -> None:
         """Do not train further lanes beside those whose agents read actions in other units."""
-        if json.loads(config.read_text()).get("format", 1) == FORMAT or self.has_ended():
+        if json.loads(config.read_text("utf-8")).get("format", 1) == FORMAT or self.has_ended():
             return
         for cell in self.cells:
             env = cell.make_env()
@@ -231,7 +231,7 @@ class RunDirectory:
         """End a line that was cut short; the lanes and steps that the log has."""
         log = self.path / LOG
         if log.exists() and not log.read_bytes().endswith(b"\n"):
-            with log.open("a") as file:
+            with log.open("a", encoding="utf-8") as file:
                 file.write("\n")
         return {(*lane_of(row), row["step"]) for row in read_log(log)}
 
@@ -258,7 +258,7 @@ class RunDirectory:
                 return {"status": "lost", "step": failure["step"], "reason": failure["reason"]}
             return {"status": "done", "step": cell.config.total_steps, "reason": ""}
         if self.error_path(cell, seed).exists():
-            reason = self.error_path(cell, seed).read_text().strip()
+            reason = self.error_path(cell, seed).read_text("utf-8").strip()
             return {"status": "failed", "step": 0, "reason": reason}
         steps = checkpoint_steps(self.checkpoint_directory(cell, seed))
         kept = max(steps, default=0)
@@ -375,7 +375,7 @@ def _is_own(entry: Path) -> bool:
 
 def _read_study(config: Path) -> Any:
     try:
-        return json.loads(config.read_text())["study"]
+        return json.loads(config.read_text("utf-8"))["study"]
     except OSError as error:
         raise UserError(f"there is no study in {config.parent} ({error.strerror})") from error
     except (ValueError, KeyError, TypeError) as error:
@@ -393,7 +393,7 @@ def _with_defaults(study: Any) -> Any:
 
 def read_log(path: Path) -> list[dict[str, Any]]:
     """Rows of a log; a line that a killed process left half-written is passed over."""
-    return parse_log(path.read_text()) if path.exists() else []
+    return parse_log(path.read_text("utf-8")) if path.exists() else []
 
 
 def parse_log(text: str) -> list[dict[str, Any]]:

@@ -9,7 +9,6 @@ worker that takes the group that lags most, so that five lanes keep two cores eq
 import contextlib
 import dataclasses
 import gc
-import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -20,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rtd3jax.machine import cores
 from rtd3jax.programs import make_room, on_full
 from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.loop import HEALTHY, Lane, LaneState, Program
@@ -104,7 +104,7 @@ def workers() -> list[Any]:
     """
     first = _default_device()
     if first.platform == "cpu" and len(jax.local_devices(backend="cpu")) == 1:
-        return [first] * len(os.sched_getaffinity(0))
+        return [first] * cores()
     return jax.local_devices(backend=first.platform)
 
 

@@ -9,8 +9,10 @@ import jax
 import numpy as np
 
 from rtd3jax.config import Config
+from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
+from rtd3jax.files import user_path
 from rtd3jax.policy import Policy
 from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.lanes import (
@@ -30,6 +32,7 @@ from rtd3jax.training.loop import (
     make_program,
 )
 from rtd3jax.training.progress import Progress
+from rtd3jax.training.worth import warn_if_untrained
 
 _REASONS = {
     ENVIRONMENT_NOT_FINITE: "the environment gave an observation or reward that is not finite; "
@@ -121,7 +124,7 @@ def train(
     label = f"{config.algorithm} l={config.history_length}"
     checkpoints = None
     if checkpoint_dir is not None:
-        checkpoints = _checkpoints(Path(checkpoint_dir), config, env, checkpoint_seconds)
+        checkpoints = _checkpoints(user_path(checkpoint_dir), config, env, checkpoint_seconds)
     with Progress(groups, lambda job: label, enabled=progress) as bar:
         advance_groups(groups, bar.update, checkpoints)
     if checkpoints is not None:
@@ -154,7 +157,8 @@ def make_jobs(
 
     With ``window``, jobs of shorter history lengths share the program of that length.
     """
-    params = env.default_params if params is None else params
+    params = parameters_of(env, params)
+    warn_if_untrained(config)
     interface = describe(env, params)
     program = make_program(env, config, interface.observation_size, interface.action_shape, window)
     return [Job(program, make_lane(config, seed, params), (cell, seed)) for seed in seeds]

@@ -7,8 +7,8 @@ import pytest
 from flax import struct
 from gymnax.environments import environment, spaces
 
-from rtd3jax.envs.check import Finding, check_env, find_problems
-from rtd3jax.envs.registry import make
+from rtd3jax.envs.check import Finding, _equal, check_env, find_problems
+from rtd3jax.envs.registry import DISTURBANCES, ENVIRONMENTS, make
 from rtd3jax.errors import UserError
 
 
@@ -271,6 +271,39 @@ def test_several_problems_are_listed_together():
 )
 def test_sound_environments_pass(env_id, disturbance):
     check_env(make(env_id, disturbance, max_steps_in_episode=20))
+
+
+@pytest.mark.parametrize("disturbance", ["noise", "damped-sine"])
+def test_what_xla_computes_twice_is_no_finding(disturbance):
+    check_env(make("pendulum", disturbance, max_steps_in_episode=12))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("env_id", "disturbance"), [(e, d) for e in ENVIRONMENTS for d in DISTURBANCES[e]]
+)
+def test_every_world_of_ours_passes(env_id, disturbance):
+    check_env(make(env_id, disturbance, max_steps_in_episode=12))
+
+
+def test_nan_equals_nan():
+    """A world of NaN is not finite, and nothing else."""
+
+    class Nowhere(Good):
+        def step_env(self, key, state, action, params):
+            observation, *rest = super().step_env(key, state, action, params)
+            return observation * jnp.nan, *rest
+
+    assert {finding.kind for finding in find_problems(Nowhere())} == {"finite"}
+
+
+def test_the_tolerance_is_relative_to_the_array_and_not_for_whole_numbers():
+    large, near = jnp.array([1e4, 1.0]), jnp.array([1e4, 1.05])
+    assert _equal((large,), (near,)) and not _equal((large[1],), (near[1],))
+    assert not _equal((1e-6 * large,), (1e-6 * large + 1e-6,))
+    assert not _equal((jnp.int32(10**8),), (jnp.int32(10**8 + 1),))
+    assert _equal((jnp.array([jnp.nan, 1.0]),), (jnp.array([jnp.nan, 1.0]),))
+    assert not _equal((jax.random.key(0),), (jax.random.key(1),))
 
 
 def test_a_termination_of_its_own_is_not_a_time_limit():

@@ -139,7 +139,7 @@ def test_something_that_is_no_environment():
 
 
 def test_a_gymnasium_environment():
-    assert "gymnax" in refused(gymnasium.make("Pendulum-v1"), "no method action_space")
+    assert "gymnax" in refused(gymnasium.make("Pendulum-v1"), "is a Gymnasium environment")
 
 
 def test_the_old_five_values():
@@ -187,6 +187,21 @@ def test_unbounded_actions(bound):
         space = spaces.Box(-1.0, bound, (1,))
 
     refused(Unbounded(), "unbounded")
+
+
+@pytest.mark.parametrize("bound", [np.finfo(np.float32).max, 3e38, 1e20])
+def test_bounds_that_mean_no_limit(bound):
+    class NoLimit(Good):
+        space = spaces.Box(-bound, bound, (1,))
+
+    assert "the range that the plant can use" in refused(NoLimit(), "bounds reach")
+
+
+def test_large_bounds_are_bounds():
+    class Large(Good):
+        space = spaces.Box(-9e19, 9e19, (1,))
+
+    describe(Large(), Large().default_params)
 
 
 def test_empty_range_of_actions():

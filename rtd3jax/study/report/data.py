@@ -270,7 +270,7 @@ def _timing(rows: list[dict[str, Any]], directory: RunDirectory) -> dict[str, An
 
 def _made_with(directory: RunDirectory) -> dict[str, Any]:
     try:
-        found = json.loads((directory.path / "config.json").read_text())["made_with"]
+        found = json.loads((directory.path / "config.json").read_text("utf-8"))["made_with"]
         return found if isinstance(found, dict) else {}
     except (OSError, ValueError, KeyError, TypeError):
         return {}

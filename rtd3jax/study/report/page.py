@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rtd3jax.errors import UserError, first_line
-from rtd3jax.files import write_bytes_atomically
+from rtd3jax.files import user_path, write_bytes_atomically
 from rtd3jax.study.ceilings import ceilings_of
 from rtd3jax.study.report.data import study_data, tables_of
 from rtd3jax.study.report.playback import recordings
@@ -55,7 +55,7 @@ def write_page(
     Raises:
         UserError: when ``path`` holds something that is not a page of ours, or cannot be written.
     """
-    path = directory.path / NAME if path is None else path
+    path = directory.path / NAME if path is None else user_path(path)
     _check_ours(path)
     page = render(page_data(directory, complete=complete, playback=playback))
     try:

@@ -19,13 +19,15 @@ import pandas as pd
 
 from rtd3jax.envs.disturbances import Hidden
 from rtd3jax.envs.disturbed import Disturbed
-from rtd3jax.envs.interface import foreign_code
+from rtd3jax.envs.entry import parameters_of
+from rtd3jax.envs.interface import describe, foreign_code
 from rtd3jax.envs.pendulum import Pendulum
 from rtd3jax.envs.process import Chain
 from rtd3jax.envs.rover import Rover
 from rtd3jax.errors import UserError, first_line
 from rtd3jax.evaluate import DEFAULT_STEP_LIMIT
 from rtd3jax.files import write_bytes_atomically
+from rtd3jax.fit import check_fit
 from rtd3jax.programs import make_room
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.report.data import rows_of
@@ -90,13 +92,12 @@ def record_episodes(
     Episodes are those of ``evaluate(policy, env, episodes, seed)``. ``done`` says in which frame an
     episode ended; later frames mean nothing.
     """
+    params = parameters_of(env)
+    own = describe(env, params)
+    check_fit(policy, own.observation_size, own.action_shape, own.action_low, own.action_high)
     make_room()
-    return {
-        name: np.asarray(value)
-        for name, value in _play(
-            policy, env, env.default_params, jax.random.key(seed), episodes, steps
-        ).items()
-    }
+    frames = _play(policy, env, params, jax.random.key(seed), episodes, steps)
+    return {name: np.asarray(value) for name, value in frames.items()}
 
 
 @functools.partial(jax.jit, static_argnames=("env", "episodes", "steps"))
@@ -234,7 +235,7 @@ def _middle_seed(directory: RunDirectory, cell: Cell, lanes: pd.DataFrame) -> in
 
 def _read(path: Path, stamp: dict[str, Any]) -> dict[str, Any] | None:
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text("utf-8"))
         if all(content[name] == value for name, value in stamp.items()) and content["runs"]:
             return content
     except (OSError, ValueError, KeyError, TypeError):

@@ -1,0 +1,72 @@
+"""The operating system's locks of files: flock where there is one, Windows's byte ranges else.
+
+A lock goes when its process goes, however that ends. On a file system without locks (Lustre without
+flock, NFS without a lock daemon) it is held by nobody, and one warning says so.
+"""
+
+import errno
+import os
+import time
+import warnings
+from pathlib import Path
+from typing import Any
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+try:
+    import msvcrt as _msvcrt
+except ImportError:
+    _msvcrt = None  # type: ignore[assignment]
+
+msvcrt: Any = _msvcrt
+NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
+_SHARERS = 1024
+"""On Windows, bytes of which each holder of a shared lock locks one, and an exclusive one all."""
+
+
+def lock(handle: int, *, shared: bool = False, wait: bool = False) -> None:
+    """Lock an open file until it is closed.
+
+    Raises:
+        BlockingIOError: when another process holds it and ``wait`` is false.
+    """
+    try:
+        if fcntl is not None:
+            kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
+            fcntl.flock(handle, kind if wait else kind | fcntl.LOCK_NB)
+        elif msvcrt is not None:
+            _lock_bytes(handle, shared, wait)
+        else:
+            raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
+    except OSError as error:
+        if error.errno not in NO_LOCKS:
+            raise
+        warnings.warn(
+            f"this file system has no locks ({error.strerror}): nothing prevents a second process "
+            "from writing to the same run directory; start only one, or use --shard i/n",
+            stacklevel=2,
+        )
+
+
+def open_for_locking(path: Path, *, create: bool = True) -> int:
+    """A handle of the file, which is never a link; `os.close` lets its locks go."""
+    flags = os.O_RDWR | os.O_CREAT if create else os.O_RDONLY
+    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
+
+
+def _lock_bytes(handle: int, shared: bool, wait: bool) -> None:
+    """As `lock`, by Windows's exclusive locks of byte ranges."""
+    while True:
+        for start in range(_SHARERS) if shared else (0,):
+            os.lseek(handle, start, os.SEEK_SET)
+            try:
+                msvcrt.locking(handle, msvcrt.LK_NBLCK, 1 if shared else _SHARERS)
+                return
+            except OSError as error:
+                if error.errno not in (errno.EACCES, errno.EDEADLK):
+                    raise
+        if not wait:
+            raise BlockingIOError(errno.EAGAIN, "another process holds the lock")
+        time.sleep(0.05)

@@ -1,0 +1,48 @@
+"""Whether a configuration can train at all: said in one line before anything is compiled."""
+
+import warnings
+
+from rtd3jax.config import Config
+
+_ZERO = {
+    "actor_learning_rate": "the actor will stay as it began",
+    "critic_learning_rate": "the critics will stay as they began",
+    "tau": "the targets will stay as they began",
+    "reward_scale": "no reward will be learnt from",
+}
+
+
+def updates_of(config: Config) -> tuple[int, int]:
+    """How often the critics and the actor will be updated."""
+    steps = max(0, config.total_steps - config.learning_starts)
+    critics = -(-steps // config.update_every)
+    return critics, critics // config.policy_delay
+
+
+def why_untrained(config: Config) -> str | None:
+    """Why a configuration trains no agent, and what to change; None where it trains one."""
+    critics, actor = updates_of(config)
+    end = "the actor will stay as it began"
+    if critics == 0:
+        return (
+            f"total_steps ({config.total_steps:,}) is not more than learning_starts "
+            f"({config.learning_starts:,}), so that no update is made and {end}: "
+            "raise total_steps or lower learning_starts"
+        )
+    if actor == 0:
+        return (
+            f"policy_delay ({config.policy_delay:,}) is more than the {critics:,} critic updates "
+            f"of {config.total_steps:,} steps, so that {end}: "
+            "lower policy_delay or update_every, or raise total_steps"
+        )
+    for name, what in _ZERO.items():
+        if getattr(config, name) == 0:
+            return f"{name} is 0, so that {what}: raise it"
+    return None
+
+
+def warn_if_untrained(config: Config) -> None:
+    """Warn in one line where nothing would be learnt; a training of nothing may be meant."""
+    reason = why_untrained(config)
+    if reason is not None:
+        warnings.warn(f"{config.algorithm}: {reason}", stacklevel=4)

@@ -1,0 +1,88 @@
+"""Locks on systems and file systems that have others than flock, or none."""
+
+import errno
+import os
+import warnings
+
+import pytest
+
+from rtd3jax.study import filelock
+from rtd3jax.study.lock import deriver, is_held, writer
+
+
+class Windows:
+    """msvcrt.locking: exclusive locks of byte ranges, each owned by a handle."""
+
+    LK_NBLCK = 2
+
+    def __init__(self):
+        self.held = {}
+
+    def locking(self, handle, mode, count):
+        start, file = os.lseek(handle, 0, os.SEEK_CUR), os.fstat(handle).st_ino
+        bytes_ = {(file, byte) for byte in range(start, start + count)}
+        for other, taken in self.held.items():
+            if other != handle and taken & bytes_:
+                raise OSError(errno.EACCES, "Permission denied")
+        self.held[handle] = self.held.get(handle, set()) | bytes_
+
+
+@pytest.fixture
+def windows(monkeypatch):
+    fake = Windows()
+    monkeypatch.setattr(filelock, "fcntl", None)
+    monkeypatch.setattr(filelock, "msvcrt", fake)
+    return fake
+
+
+@pytest.fixture
+def handles(tmp_path):
+    opened = [filelock.open_for_locking(tmp_path / "lock") for _ in range(3)]
+    yield opened
+    for handle in opened:
+        os.close(handle)
+
+
+@pytest.mark.parametrize("system", ["here", "windows"])
+def test_one_exclusive_or_several_shared(system, handles, request):
+    if system == "windows":
+        request.getfixturevalue("windows")
+    one, two, three = handles
+    filelock.lock(one, shared=True)
+    filelock.lock(two, shared=True)
+    with pytest.raises(BlockingIOError):
+        filelock.lock(three)
+
+
+@pytest.mark.parametrize("system", ["here", "windows"])
+def test_nothing_beside_an_exclusive_one(system, handles, request):
+    if system == "windows":
+        request.getfixturevalue("windows")
+    filelock.lock(handles[0])
+    for shared in (True, False):
+        with pytest.raises(BlockingIOError):
+            filelock.lock(handles[1], shared=shared)
+
+
+@pytest.mark.parametrize("code", filelock.NO_LOCKS)
+def test_a_file_system_without_locks_is_a_warning(code, tmp_path, monkeypatch):
+    def flock(*_):
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(filelock.fcntl, "flock", flock)
+    with pytest.warns(UserWarning, match="has no locks .*start only one"), writer(tmp_path, (1, 2)):
+        pass
+    with pytest.warns(UserWarning), deriver(tmp_path):
+        pass
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not is_held(tmp_path)
+
+
+def test_other_errors_are_not_hidden(handles, monkeypatch):
+    def flock(*_):
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(filelock.fcntl, "flock", flock)
+    with pytest.raises(OSError, match="Input/output"):
+        filelock.lock(handles[0])
