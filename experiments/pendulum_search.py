@@ -63,11 +63,27 @@ _SHARED = {
 EVERY_FOURTH = {**_SHARED, "update_every": 4}
 HALF_BATCHES = {**_SHARED, "update_every": 2, "batch_size": 50}
 FASTER = {"actor_learning_rate": 1e-3, "tau": 0.01}
+CARRIED = {
+    "algorithm": "h-td3",
+    "total_steps": 60_000,
+    "exploration_noise": 0.5,
+    "replay_capacity": 20_000,
+    "policy_delay": 4,
+}
 CHANGES: tuple[dict, ...] = (
     EVERY_FOURTH,
     {**EVERY_FOURTH, **FASTER},
     HALF_BATCHES,
     {**HALF_BATCHES, **FASTER},
+    # More and smaller updates; faster targets; a smoothed value.
+    {**HALF_BATCHES, **FASTER, "update_every": 1, "batch_size": 32, "total_steps": 20_000},
+    {**HALF_BATCHES, **FASTER, "tau": 0.02},
+    {**HALF_BATCHES, **FASTER, "actor_noise": 0.1},
+    {**HALF_BATCHES, **FASTER, "algorithm": "lstm-td3-1ha1hc"},
+    # h-td3 explores more, forgets sooner and has a slower actor; an update of it costs less.
+    {**HALF_BATCHES, **FASTER, **CARRIED},
+    {**HALF_BATCHES, **FASTER, **CARRIED, "tau": 0.005},
+    {**HALF_BATCHES, **CARRIED, "update_every": 1},
 )
 """What each setting changes in `BASE`."""
 

@@ -54,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _start(options: argparse.Namespace, arguments: Sequence[str] | None) -> int:
     import_worlds(options.imports)
     if options.distributed and not jax.distributed.is_initialized():
-        relaunch(arguments)
+        relaunch("rtd3jax.sweep", arguments)
     if options.device:
         jax.config.update("jax_default_device", given.device(options.device))
     return _run(options)

@@ -38,34 +38,88 @@ LAYERS = {
 }
 
 
-def against_the_arrow(layer, source):
-    """Layers that ``source``, standing in ``layer``, imports though it may not."""
-    wrong = []
+def imported(source, modules):
+    """Modules of the package that ``source`` imports, wherever in it, for types alone or not."""
+    found = set()
     for node in ast.walk(ast.parse(source)):
+        names = []
         if isinstance(node, ast.ImportFrom):
-            names = [node.module or ""]
+            assert node.level == 0, "imports are absolute"
+            # ``from package import name``: a module of that name, or something in the package.
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
         elif isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
-        else:
-            continue
         for name in names:
-            parts = name.split(".")
-            ours = parts[0] == "rtd3jax" and len(parts) > 1 and parts[1] != layer
-            if ours and LAYERS[parts[1]] >= LAYERS[layer]:
-                wrong.append(parts[1])
-    return wrong
+            while name and name not in modules:
+                name = name.rpartition(".")[0]
+            found |= {name} - {""}
+    return found
 
 
-@pytest.mark.parametrize("path", sorted(ROOT.rglob("*.py")), ids=lambda p: p.stem)
-def test_imports_run_one_way(path):
-    layer = path.relative_to(ROOT).parts[0].removesuffix(".py")
-    if layer != "__init__":
-        assert against_the_arrow(layer, path.read_text()) == []
+def layer_of(module):
+    """The layer's name: the module's first part below the package."""
+    return module.split(".")[1] if "." in module else ""
 
 
-def test_the_check_can_fail():
-    assert against_the_arrow("envs", "from rtd3jax.training.run import train") == ["training"]
-    assert against_the_arrow("agents", "import rtd3jax.envs.rover") == ["envs"]
+def upward(module, imports):
+    """Those of its imports that run against the arrow: the package itself is above all."""
+    own = layer_of(module)
+    height = {**LAYERS, "": max(LAYERS.values()) + 1}
+    return sorted(
+        name for name in imports if layer_of(name) != own and height[layer_of(name)] >= height[own]
+    )
+
+
+def circle(graph):
+    """Modules that import each other in a circle; none where there is no circle."""
+    left = {module: set(imports) & set(graph) - {module} for module, imports in graph.items()}
+    while free := {module for module, imports in left.items() if not imports}:
+        left = {m: imports - free for m, imports in left.items() if m not in free}
+    return sorted(left)
+
+
+def sources():
+    """Every module's source by its name."""
+    found = {}
+    for path in sorted(ROOT.rglob("*.py")):
+        parts = path.relative_to(ROOT.parent).with_suffix("").parts
+        found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path.read_text("utf-8")
+    return found
+
+
+def graph_of(found):
+    """What each module imports. A folder's own module gathers its parts, and is left out."""
+    folders = {m for m in found if any(other.startswith(f"{m}.") for other in found)}
+    return {m: imported(text, found) for m, text in found.items() if m not in folders}
+
+
+GRAPH = graph_of(sources())
+
+
+@pytest.mark.parametrize("module", GRAPH)
+def test_imports_run_one_way(module):
+    assert upward(module, GRAPH[module]) == []
+
+
+def test_no_modules_import_each_other():
+    assert circle(GRAPH) == []
+
+
+def test_the_checks_can_fail():
+    planted = {
+        "rtd3jax": "",
+        "rtd3jax.sweep": "from rtd3jax.study.hosts import relaunch",
+        "rtd3jax.study": "",
+        "rtd3jax.study.hosts": "from rtd3jax.study import launch",
+        "rtd3jax.study.launch": "def main():\n    from rtd3jax import sweep",
+        "rtd3jax.envs.rover": "import rtd3jax.training.run\nfrom rtd3jax import Config",
+        "rtd3jax.training.run": "",
+    }
+    graph = graph_of(planted)
+    assert upward("rtd3jax.study.launch", graph["rtd3jax.study.launch"]) == ["rtd3jax.sweep"]
+    wrong = upward("rtd3jax.envs.rover", graph["rtd3jax.envs.rover"])
+    assert wrong == ["rtd3jax", "rtd3jax.training.run"]
+    assert circle(graph) == ["rtd3jax.study.hosts", "rtd3jax.study.launch", "rtd3jax.sweep"]
 
 
 def test_public_names_exist():

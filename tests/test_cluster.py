@@ -69,7 +69,10 @@ def test_two_processes_with_half_the_devices_each_give_the_bits_of_one_with_all(
 def test_a_process_without_a_job_is_told_what_to_set(tmp_path):
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("SLURM", "OMPI"))}
     done = subprocess.run(
-        [sys.executable, "-P", hosts.launch.__file__, *STUDY, "--out", str(tmp_path / "run")],
+        [
+            *(sys.executable, "-P", hosts.launch.__file__, "rtd3jax.sweep"),
+            *(*STUDY, "--out", str(tmp_path / "run")),
+        ],
         env=environment,
         capture_output=True,
         text=True,

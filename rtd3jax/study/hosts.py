@@ -18,11 +18,15 @@ from rtd3jax.study import launch
 from rtd3jax.training.lanes import Job
 
 
-def relaunch(arguments: Sequence[str] | None) -> NoReturn:
-    """Become a process that has joined its job, and run the sweep again there.
+def relaunch(command: str, arguments: Sequence[str] | None) -> NoReturn:
+    """Become a process that has joined its job, and run the command again there.
+
+    Args:
+        command: the module whose ``main`` is run.
+        arguments: that were given to it from Python; None where it was run as a command.
 
     Raises:
-        UserError: when the sweep was called from Python, where no process may be replaced.
+        UserError: when the command was called from Python, where no process may be replaced.
     """
     if arguments is not None:
         raise UserError(
@@ -33,8 +37,8 @@ def relaunch(arguments: Sequence[str] | None) -> NoReturn:
     path = os.pathsep.join(filter(None, (package, os.environ.get("PYTHONPATH"))))
     sys.stdout.flush()
     # -P: the file's own directory holds modules of the package, which must not stand alone.
-    command = [sys.executable, "-P", launch.__file__, *sys.argv[1:]]
-    os.execve(sys.executable, command, {**os.environ, "PYTHONPATH": path})
+    line = [sys.executable, "-P", launch.__file__, command, *sys.argv[1:]]
+    os.execve(sys.executable, line, {**os.environ, "PYTHONPATH": path})
 
 
 def own_share(jobs: Sequence[Job]) -> list[Job]:

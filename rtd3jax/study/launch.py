@@ -1,10 +1,11 @@
-"""Joins a job of several processes, then runs the sweep: ``python launch.py SWEEP-ARGUMENTS``.
+"""Joins a job of several processes, then runs a command: ``python launch.py MODULE ARGUMENTS``.
 
 A process may join only before JAX has touched a device, and importing gymnax touches one; so this
 file is run by its path, in a process of its own, and imports the package last.
 `rtd3jax.study.hosts` starts it.
 """
 
+import importlib
 import os
 import sys
 
@@ -20,7 +21,7 @@ def number(name: str) -> int | None:
 
 
 def main() -> int:
-    """Join, sweep, leave; the sweep's exit status."""
+    """Join, run the module's ``main``, leave; its exit status."""
     try:
         jax.distributed.initialize(
             num_processes=number("JAX_NUM_PROCESSES"),
@@ -36,9 +37,7 @@ def main() -> int:
             file=sys.stderr,
         )
         return 2
-    from rtd3jax import sweep
-
-    return sweep.main(sys.argv[1:])
+    return importlib.import_module(sys.argv[1]).main(sys.argv[2:])
 
 
 if __name__ == "__main__":

@@ -24,18 +24,21 @@ ROVER_SETTINGS: dict[str, Any] = {
 }
 """One setting for all agents."""
 
-PENDULUM_STEPS = 40_000
-PENDULUM_STEPS_FACTOR = {"h-td3": 3}
+PENDULUM_STEPS = 30_000
+PENDULUM_STEPS_FACTOR = {"h-td3": 2}
 PENDULUM_DISTURBANCES = ("temporal-sine", "random-sine", "noise", "hidden")
 ACTION_HISTORY_DISTURBANCES = ("none", "temporal-bias", "noise:sigma=1.0")
 """Under which the paper compares `lstm-td3` with and without past actions, besides the others."""
 PENDULUM_HISTORY_LENGTHS = (1, 3, 6, 10, 20)
 PENDULUM_SETTINGS: dict[str, Any] = {
+    "batch_size": 50,
+    "update_every": 2,
     "critic_learning_rate": 3e-3,
-    "actor_learning_rate": 3e-4,
+    "actor_learning_rate": 1e-3,
     "final_learning_rate_fraction": 0.0,
     "gamma": 0.97,
     "reward_scale": 0.1,
+    "tau": 0.01,
     "exploration_noise": 0.2,
 }
 PENDULUM_OWN_SETTINGS: dict[str, dict[str, Any]] = {
