@@ -22,6 +22,7 @@ from rtd3jax.load import load_policy
 from rtd3jax.pendulum_filter import filter_policy
 from rtd3jax.play_gymnasium import run_in_gymnasium
 from rtd3jax.policy import Policy, constant_policy, random_policy
+from rtd3jax.study.plan import Cell
 from rtd3jax.training.run import Failure, Run, train
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "ENVIRONMENTS",
     "Agent",
     "Ceiling",
+    "Cell",
     "Chain",
     "Config",
     "DampedSine",
@@ -50,6 +52,7 @@ __all__ = [
     "Quantisation",
     "Run",
     "Sine",
+    "Study",
     "Sum",
     "UserError",
     "Variant",
@@ -78,3 +81,12 @@ __all__ = [
 ]
 
 register_with_gymnasium()
+
+
+def __getattr__(name: str) -> object:
+    """`Study`, with which pandas and matplotlib come, is imported when it is asked for."""
+    if name == "Study":
+        from rtd3jax.study.study import Study
+
+        return Study
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,9 +1,9 @@
 """`train`: seeds of one configuration on one environment; the library's main call."""
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import jax
 import numpy as np
@@ -89,6 +89,7 @@ class Run:
         return next(failure for failure in self.failures if failure.seed == seed)
 
 
+@overload
 def train(
     env: Any,
     config: Config,
@@ -99,49 +100,116 @@ def train(
     strategy: str | None = None,
     checkpoint_dir: str | Path | None = None,
     checkpoint_seconds: float | None = None,
-) -> Run:
-    """Train one lane per seed.
+) -> Run: ...
+
+
+@overload
+def train(
+    env: Any,
+    config: Sequence[Config],
+    seeds: Iterable[int] = range(5),
+    *,
+    params: Any = None,
+    progress: bool = True,
+    strategy: str | None = None,
+    checkpoint_dir: str | Path | None = None,
+    checkpoint_seconds: float | None = None,
+) -> list[Run]: ...
+
+
+def train(
+    env: Any,
+    config: Config | Sequence[Config],
+    seeds: Iterable[int] = range(5),
+    *,
+    params: Any = None,
+    progress: bool = True,
+    strategy: str | None = None,
+    checkpoint_dir: str | Path | None = None,
+    checkpoint_seconds: float | None = None,
+) -> Run | list[Run]:
+    """Train one lane per seed, of one configuration or of each of several.
 
     Args:
         env: a gymnax >= 1.0 environment with a bounded Box of actions.
-        config: of the agent.
+        config: of the agent; or several, of which those that differ in traced fields alone (such
+            as learning rates and the discount) share one compiled program.
         seeds: distinct integers of at least 0; a seed's result does not depend on the others.
         params: the environment's parameters; its own by default.
         progress: whether to show a bar.
         checkpoint_dir: where lanes keep checkpoints. The same call again goes on from them, to the
-            bit; seeds that were finished are not trained again.
+            bit; seeds that were finished are not trained again. Of several configurations each has
+            a directory there, ``config-0``, ``config-1``, ...
         checkpoint_seconds: between two checkpoints of a lane; five minutes by default, or longer
             where they would cost more than 2%.
         strategy: ``map`` (lanes one by one, each on one core) or ``vmap`` (side by side); by
             default what suits the backend.
 
+    Returns:
+        The run; of several configurations, a run for each, in their order.
+
     Raises:
         UserError: for an unfit environment or impossible arguments, before anything is compiled.
     """
+    single = isinstance(config, Config)
+    configs = [config] if isinstance(config, Config) else list(config)
+    if not configs or not all(isinstance(one, Config) for one in configs):
+        raise UserError(f"config must be an rtd.Config, or several of them, not {config!r}")
     seeds = check_seeds(seeds)
-    jobs = make_jobs(env, config, seeds, params=params)
+    jobs = [
+        job
+        for index, one in enumerate(configs)
+        for job in make_jobs(env, one, seeds, params=params, cell=index)
+    ]
     groups = make_groups(jobs, check_strategy(strategy), len(workers()))
-    label = f"{config.algorithm} l={config.history_length}"
     checkpoints = None
     if checkpoint_dir is not None:
-        checkpoints = _checkpoints(user_path(checkpoint_dir), config, env, checkpoint_seconds)
-    with Progress(groups, lambda job: label, enabled=progress) as bar:
+        directory = user_path(checkpoint_dir)
+        parts = [directory] if single else [directory / f"config-{k}" for k in range(len(configs))]
+        checkpoints = _checkpoints(parts, configs, env, checkpoint_seconds)
+
+    def label(job: Job) -> str:
+        own = configs[job.owner[0]]
+        number = "" if single else f" {job.owner[0]}"
+        return f"{own.algorithm} l={own.history_length}{number}"
+
+    with Progress(groups, label, enabled=progress) as bar:
         advance_groups(groups, bar.update, checkpoints)
     if checkpoints is not None:
         for group in groups:
             if group.error is None:
                 checkpoints.save(group.lanes(), group, group.step)
-    return collect(config, seeds, groups)
+    lanes = _ended(groups)
+    runs = [
+        collect(one, seeds, {seed: lanes[index, seed] for seed in seeds})
+        for index, one in enumerate(configs)
+    ]
+    return runs[0] if single else runs
 
 
-def _checkpoints(directory: Path, config: Config, env: Any, seconds: float | None) -> Checkpoints:
+def _checkpoints(
+    directories: Sequence[Path], configs: Sequence[Config], env: Any, seconds: float | None
+) -> Checkpoints:
     world = {"env": str(getattr(env, "name", type(env).__name__)), "params": None}
 
     def identity(job: Job) -> dict[str, Any]:
+        index, seed = job.owner
         params = [np.asarray(leaf).tolist() for leaf in jax.tree.leaves(job.lane.env_params)]
-        return {**config.to_dict(), **world, "params": params, "seed": job.owner[1]}
+        return {**configs[index].to_dict(), **world, "params": params, "seed": seed}
 
-    return Checkpoints(lambda job: directory / f"seed-{job.owner[1]}", identity, seconds)
+    return Checkpoints(
+        lambda job: directories[job.owner[0]] / f"seed-{job.owner[1]}", identity, seconds
+    )
+
+
+def _ended(groups: Iterable[Group]) -> dict[tuple[Any, int], tuple[Job, LaneState]]:
+    """The lanes of groups that have ended, by owner; an error of a whole group is raised."""
+    found: dict[tuple[Any, int], tuple[Job, LaneState]] = {}
+    for group in groups:
+        if group.error is not None:
+            raise group.error
+        found.update({job.owner: (job, state) for job, state in group.lanes()})
+    return found
 
 
 def make_jobs(
@@ -164,17 +232,14 @@ def make_jobs(
     return [Job(program, make_lane(config, seed, params), (cell, seed)) for seed in seeds]
 
 
-def collect(config: Config, seeds: Sequence[int], groups: Iterable[Group]) -> Run:
-    """The run of these seeds from groups that have ended; an error of a whole group is raised."""
-    found: dict[int, tuple[Job, LaneState]] = {}
-    for group in groups:
-        if group.error is not None:
-            raise group.error
-        found.update({job.owner[1]: (job, state) for job, state in group.lanes()})
+def collect(
+    config: Config, seeds: Sequence[int], lanes: Mapping[int, tuple[Job, LaneState]]
+) -> Run:
+    """The run of these seeds, from their lanes that have ended."""
     steps = evaluation_steps(config)
     failures, policies, returns, true_returns, metrics = [], [], [], [], []
     for seed in seeds:
-        job, state = found[seed]
+        job, state = lanes[seed]
         failure = failure_of(seed, state)
         curve, true_curve = curves_of(config, state, failure)
         returns.append(curve)

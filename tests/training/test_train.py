@@ -125,9 +125,29 @@ def test_lengths_side_by_side_equal_exact_windows():
     for (_, state), config in zip(groups[0].lanes(), configs, strict=True):
         exact = make_groups(cell_jobs([Cell("rover", "ar1-slip", config)], [0], "map"), "map", 1)
         advance_groups(exact, lambda group: None)
-        run = collect(config, [0], exact)
+        run = collect(config, [0], {0: next(iter(exact[0].lanes()))})
         np.testing.assert_allclose(state.returns, run.returns[0], rtol=1e-4)
         for a, b in zip(
             jax.tree.leaves(state.learner.actor), jax.tree.leaves(run.policy(0).actor), strict=True
         ):
             np.testing.assert_allclose(a, b, atol=1e-4)
+
+
+def test_several_configurations_are_trained_as_each_alone(tmp_path):
+    env = rtd.make("rover", "ar1-slip")
+    tiny = dict(total_steps=40, hidden_size=4, batch_size=4, learning_starts=10, eval_every=20)
+    configs = [
+        rtd.Config(algorithm="td3", critic_learning_rate=rate, eval_episodes=1, **tiny)
+        for rate in (1e-3, 3e-2)
+    ]
+    alone = [rtd.train(env, config, seeds=[0, 1], progress=False) for config in configs]
+    together = rtd.train(env, configs, seeds=[0, 1], progress=False, checkpoint_dir=tmp_path)
+    assert [run.config for run in together] == configs
+    for one, other in zip(alone, together, strict=True):
+        np.testing.assert_array_equal(one.returns, other.returns)
+    assert not np.array_equal(together[0].returns, together[1].returns)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["config-0", "config-1"]
+    again = rtd.train(env, configs, seeds=[0, 1], progress=False, checkpoint_dir=tmp_path)
+    np.testing.assert_array_equal(again[1].returns, together[1].returns)
+    with pytest.raises(rtd.UserError, match="rtd.Config, or several"):
+        rtd.train(env, [], progress=False)

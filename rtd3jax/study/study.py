@@ -1,0 +1,161 @@
+"""`Study`: what ``python -m rtd3jax.sweep`` does, from Python.
+
+study = rtd.Study(
+    [rtd.Cell("rover", "ar1-slip", rtd.Config(algorithm=name)) for name in ("td3", "h-td3")],
+    seeds=range(5),
+    out="runs/mine",
+)
+study.run()
+study.tables()["episodes"].groupby("algorithm")["return"].mean()
+"""
+
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import pandas as pd
+
+from rtd3jax.errors import UserError
+from rtd3jax.files import user_path
+from rtd3jax.policy import Policy
+from rtd3jax.study.ceilings import ceilings_of, compute_ceilings
+from rtd3jax.study.execute import Work, train_here
+from rtd3jax.study.figures import final_returns, learning_curves
+from rtd3jax.study.lock import writer
+from rtd3jax.study.loggers import check_loggers, open_loggers
+from rtd3jax.study.memory import lanes_at_once, memory
+from rtd3jax.study.plan import Cell, cell_jobs
+from rtd3jax.study.references import references_of
+from rtd3jax.study.report.page import refresh_page, write_page
+from rtd3jax.study.results import CURVES, EPISODES, METRICS, read_table
+from rtd3jax.study.rundir import RunDirectory
+from rtd3jax.training.lanes import workers
+from rtd3jax.training.run import check_seeds, check_strategy
+
+
+class Study:
+    """Cells with the same seeds, in a run directory.
+
+    Args:
+        cells: what is trained: an environment, a disturbance and a configuration each.
+        seeds: of each cell's lanes.
+        out: the run directory. A study that is there already is gone on with.
+        final_episodes: of the evaluation at a lane's end.
+
+    Raises:
+        UserError: when two cells cannot be told apart in the tables, when ``out`` holds another
+            study, or when it cannot be written.
+    """
+
+    def __init__(
+        self,
+        cells: Iterable[Cell],
+        *,
+        seeds: Iterable[int] = range(5),
+        out: str | os.PathLike,
+        final_episodes: int = 20,
+    ) -> None:
+        self._cells = _distinct(cells)
+        self._directory = RunDirectory(
+            user_path(out), self._cells, check_seeds(seeds), final_episodes
+        )
+
+    @property
+    def path(self) -> Path:
+        """The run directory."""
+        return self._directory.path
+
+    def run(
+        self,
+        *,
+        quiet: bool = False,
+        page: bool = True,
+        log: Sequence[str] = (),
+        strategy: str | None = None,
+        checkpoint_seconds: float | None = None,
+    ) -> list[str]:
+        """Train the lanes that are missing, then write tables, pictures and the page.
+
+        Args:
+            quiet: no progress bar.
+            page: whether to write ``report.html``.
+            log: trackers: ``tensorboard``, ``wandb``, ``mlflow``.
+            strategy: ``map`` or ``vmap``; by default what suits the backend.
+            checkpoint_seconds: between checkpoints of a lane; by default as the sweep's.
+
+        Returns:
+            A line for each lane that was lost or failed.
+        """
+        directory, strategy = self._directory, check_strategy(strategy)
+        check_loggers(log)
+        jobs = cell_jobs(directory.cells, directory.seeds, strategy)
+        at_once = lanes_at_once(jobs, strategy, len(workers()), memory())
+        work = Work(strategy, at_once, (checkpoint_seconds, None), quiet=quiet, page=page)
+        complaints: list[str] = []
+        references = references_of(directory.cells)
+        with writer(directory.path, None):
+            try:
+                with open_loggers(log, directory) as logger:
+                    train_here(directory, jobs, work, complaints, references, logger)
+            finally:
+                directory.derive(references)
+            if page:
+                compute_ceilings(directory.path, directory.cells)
+                refresh_page(directory, complete=True)
+        return complaints
+
+    def status(self) -> pd.DataFrame:
+        """A row per lane: its cell, its seed, how far it is, and why it ended if it was lost."""
+        return pd.DataFrame(self._directory.ledger())
+
+    def tables(self) -> dict[str, pd.DataFrame]:
+        """The tables ``curves``, ``episodes`` and ``metrics``, of the lanes that are done.
+
+        Raises:
+            UserError: when nothing was trained yet.
+        """
+        schemas = {"curves": CURVES, "episodes": EPISODES, "metrics": METRICS}
+        return {
+            name: read_table(self.path / f"{name}.parquet", schema)
+            for name, schema in schemas.items()
+        }
+
+    def figures(self) -> list[Path]:
+        """Draw learning curves and final returns again; the paths of the pictures."""
+        tables = self.tables()
+        best = ceilings_of(self.path, self._directory.cells, compute=False)
+        curves, episodes = tables["curves"], tables["episodes"]
+        return [
+            *learning_curves(curves, episodes, self.path, best),
+            *final_returns(episodes, self.path, best),
+        ]
+
+    def report(self) -> Path:
+        """Write the page again; its path."""
+        return write_page(self._directory)
+
+    def policy(self, cell: Cell, seed: int) -> Policy:
+        """The trained policy of a lane.
+
+        Raises:
+            UserError: when the lane is not done, or was lost.
+        """
+        return self._directory.policy(cell, seed)
+
+
+def _distinct(cells: Iterable[Cell]) -> list[Cell]:
+    """The cells, if each can be told from the others by what stands in tables."""
+    found: dict[tuple[object, ...], Cell] = {}
+    for cell in cells:
+        if not isinstance(cell, Cell):
+            raise UserError(f"a study is made of rtd.Cell, not {type(cell).__name__}")
+        key = tuple(cell.key.values())
+        if key in found and found[key] != cell:
+            raise UserError(
+                f"two cells are both {', '.join(map(str, key))}: tables tell cells apart by "
+                f"{', '.join(cell.key)} alone; put them in studies of their own"
+            )
+        found[key] = cell
+    if not found:
+        raise UserError("a study needs at least one cell")
+    return list(found.values())

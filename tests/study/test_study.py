@@ -1,0 +1,63 @@
+"""A study from Python is the sweep's, file for file."""
+
+import pandas as pd
+import pytest
+
+import rtd3jax as rtd
+from rtd3jax import sweep
+
+TINY = dict(
+    total_steps=40,
+    hidden_size=4,
+    batch_size=4,
+    learning_starts=10,
+    eval_every=20,
+    eval_episodes=1,
+)
+
+
+def _cells(**changes):
+    return [
+        rtd.Cell("rover", "ar1-slip", rtd.Config(algorithm=name, history_length=length, **settings))
+        for name, length in (("td3", None), ("h-td3", 2))
+        for settings in [TINY | changes]
+    ]
+
+
+def test_a_study_is_the_sweeps_file_for_file(tmp_path):
+    study = rtd.Study(_cells(), seeds=[0, 1], out=tmp_path / "study", final_episodes=2)
+    assert set(study.status()["status"]) == {"planned"}
+    assert study.run(quiet=True, page=False) == []
+    flags = [f"--{name.replace('_', '-')}={value}" for name, value in TINY.items()]
+    command = "--env rover --disturbances ar1-slip --algorithms td3 h-td3 --history-lengths 2"
+    command += " --seeds 2 --final-episodes 2 --quiet --no-report"
+    assert sweep.main([*command.split(), *flags, "--out", str(tmp_path / "sweep")]) == 0
+    for name in ("curves.parquet", "episodes.parquet", "metrics.parquet", "summary.md"):
+        one, other = (tmp_path / run / name for run in ("study", "sweep"))
+        assert one.read_bytes() == other.read_bytes(), name
+    lanes = sorted(p.relative_to(tmp_path / "sweep") for p in tmp_path.glob("sweep/lanes/*/*"))
+    assert len(lanes) == 4
+    for lane in lanes:
+        one, other = (tmp_path / run / lane for run in ("study", "sweep"))
+        assert one.read_bytes() == other.read_bytes()
+
+    again = rtd.Study(_cells(), seeds=[0, 1], out=tmp_path / "study", final_episodes=2)
+    assert set(again.status()["status"]) == {"done"}
+    tables = again.tables()
+    assert set(tables) == {"curves", "episodes", "metrics"}
+    assert isinstance(tables["metrics"], pd.DataFrame) and len(tables["curves"]) == 8
+    assert all(path.exists() for path in again.figures())
+    assert again.policy(_cells()[1], 1).algorithm == "h-td3"
+    with pytest.raises(rtd.UserError, match="holds another study"):
+        rtd.Study(_cells(gamma=0.5), seeds=[0, 1], out=tmp_path / "study", final_episodes=2)
+
+
+def test_cells_that_tables_could_not_tell_apart_are_refused(tmp_path):
+    both = [*_cells(), *_cells(gamma=0.5)]
+    with pytest.raises(rtd.UserError, match="two cells are both rover, ar1-slip, td3, 0"):
+        rtd.Study(both, out=tmp_path / "study")
+    with pytest.raises(rtd.UserError, match="at least one cell"):
+        rtd.Study([], out=tmp_path / "study")
+    with pytest.raises(rtd.UserError, match="made of rtd.Cell, not str"):
+        rtd.Study(["rover"], out=tmp_path / "study")
+    assert not (tmp_path / "study").exists()
