@@ -29,8 +29,8 @@ def run(tmp_path_factory):
     directory = RunDirectory(tmp_path_factory.mktemp("run"), CELLS, [0, 1, 2], 1)
     for cell in CELLS:
         actor = random_policy(cell.config.algorithm, cell.make_env(), length=3).actor
-        directory.write_lane(cell, 0, actor, CURVES, None)
-    directory.write_lane(CELLS[0], 1, {}, CURVES, {"step": 7, "reason": "loss is not finite"})
+        directory.write_lane(cell, 0, actor, CURVES, {}, None)
+    directory.write_lane(CELLS[0], 1, {}, CURVES, {}, {"step": 7, "reason": "loss is not finite"})
     return directory.path
 
 
@@ -68,7 +68,7 @@ def test_what_cannot_be_chosen_is_named(run, which, message):
 def test_a_lane_for_another_observation_is_refused(tmp_path):
     directory = RunDirectory(tmp_path / "run", [_cell("pendulum", "random-sine")], [0], 1)
     other = random_policy("h-td3", rtd.make("pendulum", "hidden"))
-    directory.write_lane(directory.cells[0], 0, other.actor, CURVES, None)
+    directory.write_lane(directory.cells[0], 0, other.actor, CURVES, {}, None)
     with pytest.raises(rtd.UserError, match="does not fit h-td3 with 3 observation elements"):
         rtd.load_policy(tmp_path / "run")
 

@@ -55,7 +55,7 @@ def purposes(program_text: str) -> dict[str, str]:
             found[name] = PRODUCTS
         elif called & {"_descend", "average"}:
             found[name] = OPTIMISERS
-        elif any(file.endswith("agents/lstm.py") for file, _ in where) and "learn" in called:
+        elif any(file.endswith("agents/memory/lstm.py") for file, _ in where) and "learn" in called:
             found[name] = LSTM
         elif "learn" in called and "sample" not in called:
             found[name] = LEARNING

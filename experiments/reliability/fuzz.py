@@ -54,7 +54,7 @@ SHAPES = {
 }
 NUMBERS = [
     f"--{name.replace('_', '-')}"
-    for name in (f.name for f in dataclasses.fields(rtd.Config) if f.metadata["traced"])
+    for name in (f.name for f in dataclasses.fields(rtd.Config) if f.metadata.get("traced"))
 ]
 OTHERS = {
     "--disturbances": ["none"],

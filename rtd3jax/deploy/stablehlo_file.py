@@ -13,6 +13,7 @@ import jax.export
 import jax.numpy as jnp
 import numpy as np
 
+from rtd3jax.agents.memory.base import Params
 from rtd3jax.deploy.model import Model, carry_shapes
 from rtd3jax.errors import UserError, first_line
 from rtd3jax.files import array_bytes, read_arrays
@@ -33,6 +34,9 @@ def stablehlo_bytes(model: Model) -> bytes:
         UserError: when the package flatbuffers is missing.
     """
     _require_flatbuffers()
+    # Here, not within what is traced, where the order of constants would be left to chance.
+    params = jax.tree.map(jnp.asarray, model.params)
+    arrays = {name: jnp.asarray(array) for name, array in model.arrays.items()}
     (batch,) = jax.export.symbolic_shape("batch")
 
     def spec(shape: tuple[int, ...]) -> jax.ShapeDtypeStruct:
@@ -41,7 +45,7 @@ def stablehlo_bytes(model: Model) -> bytes:
     def policy_step(state: State, observation: jax.Array) -> tuple[jax.Array, State]:
         # Accelerators would otherwise round products of float32 to fewer bits.
         with jax.default_matmul_precision("highest"):
-            return play(model, state, observation)
+            return play(model, params, arrays, state, observation)
 
     with _no_source_locations():
         exported = jax.export.export(jax.jit(policy_step), platforms=PLATFORMS)(
@@ -53,13 +57,14 @@ def stablehlo_bytes(model: Model) -> bytes:
     return array_bytes({"program": program}, header)
 
 
-def play(model: Model, state: State, observation: jax.Array) -> tuple[jax.Array, State]:
+def play(
+    model: Model, params: Params, arrays: State, state: State, observation: jax.Array
+) -> tuple[jax.Array, State]:
     """The recurrence of `rtd3jax.deploy.model` for ``observation`` [B, O]: any memory, any layers.
 
     The carries that stand side by side are a batch for the memory's own step.
     """
-    network, variables = model.network, {"params": jax.tree.map(jnp.asarray, model.params)}
-    arrays = {name: jnp.asarray(array) for name, array in model.arrays.items()}
+    network, variables = model.network, {"params": params}
     parts = {"observation": observation}
     if "previous_action" in state:
         parts["previous_action"] = state["previous_action"]

@@ -300,7 +300,7 @@ def test_names_are_joined_and_parameters_find_their_owner():
         (lambda: disturb(Echo(), Hidden(element=0), "action"), "action does not allow"),
         (lambda: disturb(Echo(), Delay(), "actions"), "did you mean 'action'"),
         (lambda: disturb(Echo(), 3.0), "not a process"),
-        (lambda: disturb(object(), Delay()), "no reset_env"),
+        (lambda: disturb(object(), Delay()), "object has no method reset"),
         (lambda: disturb(make("CartPole-v1"), Delay()), "discrete"),
     ],
 )

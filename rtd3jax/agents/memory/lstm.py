@@ -72,9 +72,12 @@ class LSTM(Memory):
         return zero_carry(batch, self.width)
 
     def step(self, carry: Carry, token: jax.Array) -> Carry:
-        """One token [B, I], without the hand-written gradient: for policies that act."""
-        present = jnp.ones((1, token.shape[0]), bool)
-        return lstm(self.kernels, token[None], present, carry, self.precision)
+        """The carry after ``token`` [B, I]; differentiated automatically."""
+        kernels = self.kernels
+        bias = kernels["input_bias"] + kernels["recurrent_bias"]
+        gates = matmul(token, kernels["input_kernel"], self.precision) + bias[None, :]
+        gates = gates + matmul(carry.hidden, kernels["recurrent_kernel"], self.precision)
+        return _cell(_activate(gates, jnp.ones((token.shape[0],), bool)), carry.cell)
 
     def read(self, carry: Carry) -> jax.Array:
         """The hidden state [B, H]."""
