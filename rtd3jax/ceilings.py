@@ -1,8 +1,8 @@
 """The best possible return of a world, which a trained agent cannot exceed on average.
 
-Rover (spec section 6): slip is exogenous and the motion has no memory, so the best policy is
-myopic. The last action and the observation give the realised slip exactly; the best command then
-minimises the expected squared error under the conditional moments of the next slip.
+Rover: slip is exogenous and the motion has no memory, so the best policy is myopic. The last action
+and the observation give the realised slip exactly; the best command then minimises the expected
+squared error under the conditional moments of the next slip.
 
 Pendulum: the fully observable optimum, by `rtd3jax.value_iteration`; it bounds every disturbed case
 from above. `rtd3jax.pendulum_filter` has a policy that bounds some of them from below.

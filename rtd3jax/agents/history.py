@@ -1,4 +1,4 @@
-"""Histories: the tokens that an agent may read, cut from a ring of steps (paper, Section 4).
+"""Histories: the tokens that an agent may read, cut from a ring of steps (paper, Section 5.1).
 
 One function, `window_at`, serves acting, replay, evaluation and deployment. Its invariant: the
 tokens that exist are the last of the window. What is before an episode's first step, before the

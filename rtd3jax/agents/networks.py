@@ -1,4 +1,4 @@
-"""Actor and critic: encoder, memory, head (paper, Table 4: "Structure"), as flax modules.
+"""Actor and critic: encoder, memory, head (paper, Appendix: "Network Structure"), as flax modules.
 
 A `Network` is put together from modules, each of which can be another: its fields are the names
 under which the parameters stand. Shapes: ``L`` past tokens, ``B`` batch, ``O`` and ``A`` sizes of

@@ -1,4 +1,4 @@
-"""The agents as data: everything that one agent differs in from another (paper, Sections 2, 4, 5).
+"""The agents as data: all in which one agent differs from another (paper, Sections 3, 5 and 6).
 
 A network has up to two streams whose features are concatenated before its head:
 

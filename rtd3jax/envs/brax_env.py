@@ -112,7 +112,7 @@ class BraxEnv(ValueIdentity, environment.Environment):
         return self.brax.action_size
 
     def action_space(self, params: BraxParams | None = None) -> spaces.Box:
-        """Within one, by Brax's convention."""
+        """Actions within [-1, 1], which is what Brax's environments expect."""
         return spaces.Box(-1.0, 1.0, (self.brax.action_size,), jnp.float32)
 
     def observation_space(self, params: BraxParams | None = None) -> spaces.Box:

@@ -1,4 +1,4 @@
-"""Disturbances of an observation [O] (spec section 4). Time is counted in environment steps.
+"""Disturbances of an observation [O] (paper, Section 5.2). Time is counted in environment steps.
 
 They act on what the agent sees, never on the true state. Every draw is made once per episode,
 unless a docstring says otherwise.
@@ -50,7 +50,7 @@ class PulsesState(struct.PyTreeNode):
 
 
 class Pulses(Process):
-    """``temporal-bias``: short constant offsets at random steps (spec section 4).
+    """``temporal-bias``: short constant offsets at random steps (paper, Section 5.2).
 
     All placements in which the pulses do not overlap and all fit the episode are equally likely.
     They are found on the way: a place becomes a pulse with probability (pulses left) / (places
@@ -128,7 +128,7 @@ class SineState(struct.PyTreeNode):
 
 
 class Sine(Process):
-    """Waves ``A sin(2 pi (t - t0)/T)``, each lasting one period (spec section 4).
+    """Waves ``A sin(2 pi (t - t0)/T)``, each lasting one period (paper, Section 5.2).
 
     The defaults are ``random-sine``; ``temporal-sine`` fixes A = 1 and T = 70, ``combined-sine``
     has two waves. The start is a whole step, uniform over those from which a whole period fits the
@@ -179,7 +179,7 @@ class Sine(Process):
 
 
 class DampedSine(Process):
-    """``exp(-(t - t0)/T) A sin(2 pi (t - t0)/T)`` from t0 to the episode's end (spec section 4).
+    """``exp(-(t - t0)/T) A sin(2 pi (t - t0)/T)`` from t0 to the end (paper, Section 5.2).
 
     t0 is uniform over the episode's steps; A and T are drawn as for ``random-sine``.
     """
@@ -233,7 +233,7 @@ def _validate_wave(process: Sine | DampedSine) -> None:
 
 
 class GaussianNoise(Process):
-    """``noise``: independent N(0, sigma^2) on every element at every step (spec section 4)."""
+    """``noise``: independent N(0, sigma^2) on every element at every step (paper, Section 5.2)."""
 
     sigma: float = 0.5
 
@@ -252,7 +252,7 @@ class GaussianNoise(Process):
 
 
 class Hidden(Process):
-    """``hidden``: one element is removed, the pendulum's angular velocity (spec section 4)."""
+    """``hidden``: one element is removed, the pendulum's angular velocity (paper, Section 5.2)."""
 
     element: int = struct.field(pytree_node=False, default=2)
 

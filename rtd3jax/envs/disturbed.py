@@ -1,4 +1,4 @@
-"""An environment whose observation, action or reward passes through a process (spec section 4)."""
+"""An environment whose observation, action or reward a process disturbs (paper, Section 5.2)."""
 
 from typing import Any
 
@@ -199,11 +199,11 @@ class Disturbed(ValueIdentity, environment.Environment):
         return self.base.num_actions
 
     def action_space(self, params: DisturbedParams | None = None) -> Any:
-        """That of the environment below."""
+        """The action space of the environment that is disturbed."""
         return self.base.action_space((self.default_params if params is None else params).env)
 
     def observation_space(self, params: DisturbedParams | None = None) -> spaces.Box:
-        """Unbounded: a disturbance may leave the bounds of the environment below."""
+        """Unbounded: a disturbance may leave the bounds of the environment that it disturbs."""
         params = self.default_params if params is None else params
         size = self._size(params, _observation_size(self.base, params.env))
         return spaces.Box(-jnp.inf, jnp.inf, (size,), jnp.float32)

@@ -1,4 +1,4 @@
-"""gymnax's pendulum (spec section 3), with the reward as a function of what the agent sees.
+"""gymnax's pendulum (paper, Section 5.2), with the reward as a function of what the agent sees.
 
 Units: rad, rad/s, N m; dt 0.05 s, torque within 2, speed within 8, 200 steps, never terminates.
 The observation [3] is (cos theta, sin theta, theta dot).

@@ -77,8 +77,8 @@ ENVIRONMENTS: tuple[str, ...] = tuple(_PROCESSES)
 DISTURBANCES: dict[str, tuple[str, ...]] = {
     env: (*ids, *_FAULTS) for env, ids in _PROCESSES.items()
 }
-"""The disturbances of each world: its own (spec sections 3 and 4), then ``FAULTS``. They can be
-joined by ``+``: ``ar1-slip+dropout``."""
+"""The disturbances of each world: its own (paper, Sections 5.2 and 8.4), then ``FAULTS``. They can
+be joined by ``+``: ``ar1-slip+dropout``."""
 
 _constructors: dict[str, Callable[..., Any]] = {}
 _registered: dict[str, tuple[Any, dict[str, tuple[str, Process]]]] = {}

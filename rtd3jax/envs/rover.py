@@ -1,4 +1,4 @@
-"""A differential-drive rover whose wheels slip (spec section 3; paper, engineering case study).
+"""A differential-drive rover whose wheels slip (paper, Section 8.2).
 
 Units: m, s, rad. Left wheel first. The motion has no memory: each command sets the speeds of its
 own step. The only hidden thing is the slip, which acts inside the dynamics.

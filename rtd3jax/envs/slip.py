@@ -1,4 +1,4 @@
-"""Wheel slip (spec section 3): hidden from the agent, independent for the two wheels.
+"""Wheel slip (paper, Section 8.2): hidden from the agent, independent for the two wheels.
 
 The signal is the nominal speed of the wheels [2] in m/s, left and right; what leaves is the
 realised speed, ``(1 - slip)`` times nominal. The slip of step t acts on ``a_t`` and then evolves.

@@ -7,11 +7,11 @@ from rtd3jax.study.report.page import refresh_page
 from rtd3jax.study.rundir import Reference, RunDirectory
 
 SECONDS = 60.0
-"""At most so often."""
+"""Between two writings of the tables and the page, at least."""
 
 
 class EarlyAnswers:
-    """Makes them anew, now and then."""
+    """Writes tables, pictures and page again while lanes are still trained."""
 
     def __init__(self, directory: RunDirectory, references: Sequence[Reference], *, page: bool):
         self._directory = directory
@@ -20,7 +20,7 @@ class EarlyAnswers:
         self._made = time.perf_counter()
 
     def refresh(self) -> None:
-        """Make them, unless that was done a moment ago."""
+        """Write them, unless they were written less than `SECONDS` ago."""
         if time.perf_counter() - self._made > SECONDS:
             self._directory.derive(self._references)
             if self._page:

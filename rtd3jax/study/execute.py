@@ -45,7 +45,7 @@ def train_here(
 ) -> None:
     """Train the lanes that are not done; ``complaints`` gains a line for each that fails.
 
-    With ``references``, tables and page are refreshed now and then.
+    With ``references``, tables and page are written again about once a minute.
     """
     waiting = waiting_jobs(directory, jobs)
     for job in waiting:

@@ -42,7 +42,14 @@ PENDULUM_SETTINGS: dict[str, Any] = {
     "exploration_noise": 0.2,
 }
 PENDULUM_OWN_SETTINGS: dict[str, dict[str, Any]] = {
-    "h-td3": {"exploration_noise": 0.5, "replay_capacity": 20_000, "policy_delay": 4},
+    "h-td3": {
+        "update_every": 1,
+        "actor_learning_rate": 3e-4,
+        "tau": 0.005,
+        "exploration_noise": 0.5,
+        "replay_capacity": 20_000,
+        "policy_delay": 4,
+    },
 }
 """h-td3's critics read carries that an actor of long ago stored, and the actor moves on."""
 

@@ -63,7 +63,7 @@ def _np_lstm(params, tokens, h, c):
 
 
 def _np_network(p, name, role, w, b, action, stored):
-    """One sample of one network, agent by agent, as the spec's tables say it in words."""
+    """One sample of one network, agent by agent, as the paper says it in words."""
 
     def linear(q, x):
         return x @ q["kernel"] + q["bias"]
