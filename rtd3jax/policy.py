@@ -207,6 +207,15 @@ class Policy:
                 raise UserError(f"the policy's weights are not finite ({name}); it cannot be used")
         return actor
 
+    def interface(self) -> dict[str, Any]:
+        """Sizes and bounds of the environment that it is for, as headers of files hold them."""
+        return {
+            "observation_size": self.observation_size,
+            "action_shape": list(self.action_shape),
+            "action_low": np.asarray(self.bounds.low).tolist(),
+            "action_high": np.asarray(self.bounds.high).tolist(),
+        }
+
     def _about(self) -> dict[str, Any]:
         """The header of a file that holds the policy."""
         return {
@@ -214,10 +223,7 @@ class Policy:
             "format": FORMAT,
             "algorithm": self.algorithm,
             "history_length": int(self.history_length),
-            "observation_size": self.observation_size,
-            "action_shape": list(self.action_shape),
-            "action_low": np.asarray(self.bounds.low).tolist(),
-            "action_high": np.asarray(self.bounds.high).tolist(),
+            **self.interface(),
             "centre_token": np.asarray(self.centre_token).tolist(),
             "hidden_size": self.width,
             "memory": self.memory,
