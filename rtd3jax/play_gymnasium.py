@@ -9,6 +9,7 @@ import numpy as np
 from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT
 from rtd3jax.errors import UserError
 from rtd3jax.fit import check_fit
+from rtd3jax.policy import Policy
 
 
 def run_in_gymnasium(policy: Any, gym_env: Any, episodes: int = 10, seed: int = 0) -> np.ndarray:
@@ -25,7 +26,8 @@ def run_in_gymnasium(policy: Any, gym_env: Any, episodes: int = 10, seed: int = 
         seed: of the episodes; the first n of more episodes are those of n episodes.
 
     Raises:
-        UserError: for spaces that do not fit the policy, or impossible arguments.
+        UserError: for spaces that do not fit the policy, or impossible arguments; at a step at
+            which an action or a reward is not finite, or the observation for a policy from here.
     """
     if isinstance(episodes, bool) or episodes != int(episodes) or episodes < 1:
         raise UserError(f"episodes must be an integer of at least 1, not {episodes!r}")
@@ -51,14 +53,24 @@ def _play(policy: Any, env: Any, episodes: int, seed: int) -> np.ndarray:
     for index, episode_seed in enumerate(np.random.SeedSequence(seed).generate_state(episodes)):
         observation, _ = env.reset(seed=int(episode_seed))
         state = policy.init(jax.random.key(int(episode_seed)))
-        for _ in range(DEFAULT_STEP_LIMIT):
+        for step in range(DEFAULT_STEP_LIMIT):
+            where = f"at step {step} of episode {index}"
+            if isinstance(policy, Policy):
+                _check_finite(where, "environment's observation", observation)
             action, state = _act(policy, state, np.asarray(observation, np.float32))
+            _check_finite(where, "policy's action", action)
             action = np.clip(np.asarray(action, space.dtype), space.low, space.high)
             observation, reward, terminated, truncated, _ = env.step(action)
+            _check_finite(where, "environment's reward", reward)
             returns[index] += float(reward)
             if terminated or truncated:
                 break
     return returns
+
+
+def _check_finite(where: str, what: str, value: Any) -> None:
+    if not np.isfinite(np.asarray(value, np.float64)).all():
+        raise UserError(f"{where} the {what} is {np.asarray(value).tolist()}, which is not finite")
 
 
 @jax.jit

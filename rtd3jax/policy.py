@@ -99,15 +99,46 @@ class Policy:
     def step(self, state: PolicyState, observation: jax.Array) -> tuple[jax.Array, PolicyState]:
         """The action for ``observation`` [O], and the state that remembers both.
 
+        Outside `jax.jit` and `jax.vmap` it is compiled at the first call, and refuses readings that
+        are not finite. Where it is traced nothing can be refused: they are remembered.
+
         Raises:
-            UserError: when the observation has another size than those the policy was trained on.
+            UserError: when the observation has another size than those the policy was trained on,
+                or is not finite; nothing is remembered of it then.
         """
-        observation = jnp.asarray(observation, jnp.float32)
-        if observation.shape != (self.observation_size,):
+        traced = any(
+            isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((self, state, observation))
+        )
+        if traced:
+            observation = jnp.asarray(observation, jnp.float32)
+            self._check_shape(observation.shape)
+            return self._step(state, observation)
+        with np.errstate(over="ignore"):
+            reading = np.asarray(observation, np.float32)
+        self._check_shape(reading.shape)
+        if not np.isfinite(reading).all():
             raise UserError(
-                f"the policy expects observations of shape ({self.observation_size},), "
-                f"not {observation.shape}: it was trained on another environment"
+                f"the observation {reading.tolist()} is not finite, and nothing was remembered of "
+                "it: step with the last good reading, or start the episode anew with policy.init()"
             )
+        return _compiled_step(self, state, reading)
+
+    def _check_shape(self, shape: tuple[int, ...]) -> None:
+        expected = (self.observation_size,)
+        if shape == expected:
+            return
+        if len(shape) == 2 and shape[1:] == expected:
+            raise UserError(
+                f"the policy steps one plant, with observations of shape {expected}, not {shape}: "
+                "give observation[0], or for a batch use jax.vmap(policy.step) with one state for "
+                "each plant"
+            )
+        raise UserError(
+            f"the policy expects observations of shape {expected}, not {shape}: it was trained on "
+            "another environment"
+        )
+
+    def _step(self, state: PolicyState, observation: jax.Array) -> tuple[jax.Array, PolicyState]:
         time = state.time[None]
         window = window_at(
             state.steps,
@@ -176,6 +207,15 @@ class Policy:
                 raise UserError(f"the policy's weights are not finite ({name}); it cannot be used")
         return actor
 
+    def interface(self) -> dict[str, Any]:
+        """Sizes and bounds of the environment that it is for, as headers of files hold them."""
+        return {
+            "observation_size": self.observation_size,
+            "action_shape": list(self.action_shape),
+            "action_low": np.asarray(self.bounds.low).tolist(),
+            "action_high": np.asarray(self.bounds.high).tolist(),
+        }
+
     def _about(self) -> dict[str, Any]:
         """The header of a file that holds the policy."""
         return {
@@ -183,15 +223,19 @@ class Policy:
             "format": FORMAT,
             "algorithm": self.algorithm,
             "history_length": int(self.history_length),
-            "observation_size": self.observation_size,
-            "action_shape": list(self.action_shape),
-            "action_low": np.asarray(self.bounds.low).tolist(),
-            "action_high": np.asarray(self.bounds.high).tolist(),
+            **self.interface(),
             "centre_token": np.asarray(self.centre_token).tolist(),
             "hidden_size": self.width,
             "memory": self.memory,
             "versions": versions_of(("rtd3jax", "jax", "jaxlib", "numpy")),
         }
+
+
+@jax.jit
+def _compiled_step(
+    policy: Policy, state: PolicyState, observation: jax.Array
+) -> tuple[jax.Array, PolicyState]:
+    return policy._step(state, observation)
 
 
 @struct.dataclass

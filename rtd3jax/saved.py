@@ -37,7 +37,7 @@ def read_policy(path: str | os.PathLike) -> Policy:
     arrays, about = read_arrays(path)
     if isinstance(about, dict) and "cell" in about and "seed" in about:
         raise UserError(
-            f"{path} is a lane of a run directory and lacks the action's bounds: load it with "
+            f"{path} is a lane of a run directory and no saved policy: load it with "
             f"load_policy({str(Path(path).parents[2])!r}, algorithm=..., seed={about['seed']})"
         )
     if not isinstance(about, dict) or about.get("kind") != KIND:
@@ -156,10 +156,34 @@ def _header(path: str | os.PathLike, about: dict[str, Any]) -> tuple[Interface, 
             "register yours with rtd.register_memory before you load it"
         )
     windowed = AGENTS[algorithm].has_window
-    lowest = {"observation_size": 1, "hidden_size": 1, "history_length": windowed}
+    lowest = {"hidden_size": 1, "history_length": windowed}
     for name, least in lowest.items():
         if not _is_count(about.get(name), int(least)):
             raise UserError(f"{wrong} {name} is {about.get(name)!r}")
+    interface = read_interface(path, about)
+    size = interface.action_size
+    centre_token = np.asarray(about.get("centre_token", np.zeros(size)), np.float32)
+    if centre_token.shape != (size,) or not np.all(np.isfinite(centre_token)):
+        raise UserError(f"{wrong} centre_token is not {size} numbers")
+    return interface, {
+        "format": about["format"],
+        "centre_token": centre_token,
+        "algorithm": algorithm,
+        "memory": memory,
+        "history_length": about["history_length"],
+        "width": about["hidden_size"],
+    }
+
+
+def read_interface(path: str | os.PathLike, about: Mapping[str, Any]) -> Interface:
+    """Sizes and bounds in a file's header, checked.
+
+    Raises:
+        UserError: when they are not such.
+    """
+    wrong = f"{path} is damaged: its header's"
+    if not _is_count(about.get("observation_size"), 1):
+        raise UserError(f"{wrong} observation_size is {about.get('observation_size')!r}")
     shape = about.get("action_shape")
     if not isinstance(shape, list) or not all(_is_count(n, 1) for n in shape):
         raise UserError(f"{wrong} action_shape is {shape!r}")
@@ -171,18 +195,7 @@ def _header(path: str | os.PathLike, about: dict[str, Any]) -> tuple[Interface, 
     fit = low.shape == high.shape == (size,) and np.all(np.isfinite([low, high]))
     if not fit or not np.all(low < high):
         raise UserError(f"{wrong} action bounds are not {size} pairs of low < high")
-    centre_token = np.asarray(about.get("centre_token", np.zeros(size)), np.float32)
-    if centre_token.shape != (size,) or not np.all(np.isfinite(centre_token)):
-        raise UserError(f"{wrong} centre_token is not {size} numbers")
-    interface = Interface(about["observation_size"], tuple(shape), size, low, high)
-    return interface, {
-        "format": about["format"],
-        "centre_token": centre_token,
-        "algorithm": algorithm,
-        "memory": memory,
-        "history_length": about["history_length"],
-        "width": about["hidden_size"],
-    }
+    return Interface(about["observation_size"], tuple(shape), size, low, high)
 
 
 def _is_count(value: Any, low: int) -> bool:

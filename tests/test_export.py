@@ -8,6 +8,7 @@ import pytest
 from random_policies import random_policy
 
 import rtd3jax as rtd
+from rtd3jax.envs import registry
 from rtd3jax.export import main
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.rundir import RunDirectory
@@ -77,6 +78,31 @@ def test_a_lane_file_alone_is_refused_with_the_way(run):
     lane = next(run.glob("lanes/*pendulum*/seed-0.safetensors"))
     with pytest.raises(rtd.UserError, match=r"load_policy\('.*run0', algorithm=..., seed=0\)"):
         rtd.load_policy(lane)
+
+
+def test_a_lane_of_a_world_that_is_not_registered_is_loaded_and_exported(tmp_path, monkeypatch):
+    for name in ("_registered", "_registrants"):
+        monkeypatch.setattr(registry, name, {})
+    rtd.register("robot", rtd.make("pendulum"), replace=True)
+    cell = _cell("robot", "dropout")
+    policy = random_policy("h-td3", cell.make_env())
+    directory = RunDirectory(tmp_path / "run", [cell], [0, 1], 1)
+    directory.write_lane(cell, 0, policy.actor, CURVES, {}, None, policy.interface())
+    directory.write_lane(cell, 1, policy.actor, CURVES, {}, None)  # as older versions did
+    old = rtd.load_policy(tmp_path / "run", seed=1)
+    monkeypatch.setattr(registry, "_registered", {})
+    loaded = rtd.load_policy(tmp_path / "run")
+    for other in (old, loaded):
+        assert other.interface() == policy.interface()
+        jax.tree.map(np.testing.assert_array_equal, other.actor, policy.actor)
+    out = tmp_path / "robot.py"
+    assert main([str(tmp_path / "run"), "--format", "numpy", "--out", str(out)]) == 0
+    assert out.exists()
+    with pytest.raises(rtd.UserError, match="unknown environment 'robot'"):
+        rtd.load_policy(tmp_path / "run", seed=1)
+    directory.write_lane(cell, 0, policy.actor, CURVES, {}, None, {"observation_size": 0})
+    with pytest.raises(rtd.UserError, match="damaged: its header's observation_size is 0"):
+        rtd.load_policy(tmp_path / "run")
 
 
 @pytest.mark.parametrize("form", ["onnx", "stablehlo", "numpy", "policy"])

@@ -108,3 +108,31 @@ def test_misfits_are_named(arguments, match):
     with pytest.raises(UserError, match=match) as caught:
         rtd.run_in_gymnasium(*arguments)
     assert "\n" not in str(caught.value)
+
+
+class Broken(gymnasium.Wrapper):
+    """Its third observation, or its third reward, is not a number."""
+
+    def __init__(self, what):
+        super().__init__(gymnasium.make("Pendulum-v1"))
+        self.what, self.steps = what, 0
+
+    def step(self, action):
+        observation, reward, *rest = super().step(action)
+        self.steps += 1
+        if self.steps == 3:
+            observation = observation * np.nan if self.what == "observation" else observation
+            reward = np.nan if self.what == "reward" else reward
+        return observation, reward, *rest
+
+
+@pytest.mark.parametrize(
+    ("what", "match"),
+    [
+        ("observation", r"at step 3 of episode 0 the policy's action is \[nan\]"),
+        ("reward", "at step 2 of episode 0 the environment's reward is nan"),
+    ],
+)
+def test_what_is_not_finite_is_refused_with_its_step(what, match):
+    with pytest.raises(UserError, match=match):
+        rtd.run_in_gymnasium(Swing(), Broken(what), episodes=1)

@@ -167,3 +167,33 @@ def test_a_loaded_policy_refuses_another_world(tmp_path, policy):
         loaded.step(loaded.init(), np.zeros(3))
     with pytest.raises(rtd.UserError, match="expects 2 observation elements"):
         rtd.evaluate(loaded, rtd.make("pendulum"), episodes=1)
+
+
+def test_a_reading_that_is_not_finite_is_refused_and_not_remembered(policy):
+    """Where the host sees it; a traced step cannot refuse it."""
+    state = policy.init()
+    size = policy.observation_size
+    action, state = policy.step(state, np.full(size, 0.1))
+    for bad in (np.nan, -np.inf, 1e300):
+        with pytest.raises(rtd.UserError, match="not finite, and nothing was remembered") as caught:
+            policy.step(state, np.append(np.full(size - 1, 0.1), bad))
+        assert "\n" not in str(caught.value)
+    after, _ = policy.step(state, [0.1] * size)
+    traced, _ = jax.jit(policy.step)(state, np.full(size, 0.1, np.float32))
+    np.testing.assert_allclose(after, traced, atol=1e-6)
+    assert np.isnan(jax.jit(policy.step)(state, np.full(size, np.nan, np.float32))[0]).all()
+
+
+def test_a_step_outside_jit_is_compiled_once(policy, monkeypatch):
+    state, observation = policy.init(), np.full(policy.observation_size, 0.1)
+    _, state = policy.step(state, observation)
+    monkeypatch.setattr(type(policy), "_step", None)  # what is traced again fails
+    for _ in range(3):
+        _, state = policy.step(state, observation)
+    assert int(state.time) == 4
+
+
+def test_a_batch_of_observations_gets_the_advice(policy):
+    for step in (policy.step, jax.jit(policy.step)):
+        with pytest.raises(rtd.UserError, match=r"observation\[0\], .* jax.vmap"):
+            step(policy.init(), np.zeros((1, policy.observation_size)))

@@ -4,6 +4,8 @@ gymnasium is imported by gymnax already, so that nothing here makes importing rt
 """
 
 import functools
+import os
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -24,6 +26,22 @@ from rtd3jax.envs.registry import DISTURBANCES, make
 from rtd3jax.errors import UserError
 
 NAMESPACE = "rtd3jax"
+
+_PROCESS = os.getpid()
+"""The process that imported JAX; forked ones inherit its locks but not its threads."""
+
+_seen: dict[Any, tuple[gymnasium.Space, gymnasium.Space]] = {}
+"""Spaces of what was made, for forked processes, which cannot find them out."""
+
+
+def _check_process() -> None:
+    """Raise UserError in a forked process, where JAX would wait for ever."""
+    if os.getpid() != _PROCESS:
+        raise UserError(
+            "JAX does not work in a forked process, where it would hang; start processes with "
+            'spawn: AsyncVectorEnv(..., context="spawn"), or gymnasium.make_vec(..., '
+            'vectorization_mode="async", vector_kwargs={"context": "spawn"})'
+        )
 
 
 class GymnasiumEnv(gymnasium.Env):
@@ -49,6 +67,7 @@ class GymnasiumEnv(gymnasium.Env):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Begin an episode; a ``seed`` decides it and, without further seeds, all that follow."""
+        _check_process()
         super().reset(seed=seed)
         self._key = np.uint32(self.np_random.integers(2**32, dtype=np.uint32))
         self._time, self._over = 0, False
@@ -57,6 +76,7 @@ class GymnasiumEnv(gymnasium.Env):
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One step of the episode; gymnasium.error.ResetNeeded after its end."""
+        _check_process()
         if self._over:
             raise gymnasium.error.ResetNeeded("the episode is over, or none has begun: call reset")
         action = np.asarray(action, self.action_space.dtype).reshape(self.action_space.shape)
@@ -73,6 +93,18 @@ class GymnasiumEnv(gymnasium.Env):
         return np.asarray(observation, self.observation_space.dtype)
 
 
+class _Forked(GymnasiumEnv):
+    """Stands for an environment in a forked process, until it can tell the parent: at reset.
+
+    What a vector environment's process raises earlier does not reach the one that uses it.
+    """
+
+    def __init__(self, key: Any) -> None:
+        if key not in _seen:
+            _check_process()
+        self.action_space, self.observation_space = _seen[key]
+
+
 def to_gymnasium(env: Any, *, params: Any = None) -> GymnasiumEnv:
     """Any gymnax >= 1.0 environment as a ``gymnasium.Env``, ours or anyone's, discrete or not.
 
@@ -84,14 +116,24 @@ def to_gymnasium(env: Any, *, params: Any = None) -> GymnasiumEnv:
         params: its parameters; its own by default.
 
     Raises:
-        UserError: for what is not a gymnax >= 1.0 environment.
+        UserError: for what is not a gymnax >= 1.0 environment; in forked processes.
     """
-    return GymnasiumEnv(env, params)
+    return _made(id(env), lambda: GymnasiumEnv(env, params))
 
 
 def make_gymnasium(env_id: str, disturbance: str, **parameters: Any) -> GymnasiumEnv:
     """The entry point of the registered ids."""
-    return to_gymnasium(make(env_id, disturbance, **parameters))
+    key = env_id, disturbance, repr(parameters)
+    return _made(key, lambda: GymnasiumEnv(make(env_id, disturbance, **parameters)))
+
+
+def _made(key: Any, construct: Callable[[], GymnasiumEnv]) -> GymnasiumEnv:
+    """What ``construct`` makes, or in a forked process what stands for it."""
+    if os.getpid() != _PROCESS:
+        return _Forked(key)
+    env = construct()
+    _seen[key] = env.action_space, env.observation_space
+    return env
 
 
 def gymnasium_id(env_id: str, disturbance: str) -> str:

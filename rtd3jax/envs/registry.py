@@ -5,6 +5,7 @@ import dataclasses
 import math
 import numbers
 import re
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -82,6 +83,8 @@ be joined by ``+``: ``ar1-slip+dropout``."""
 
 _constructors: dict[str, Callable[..., Any]] = {}
 _registered: dict[str, tuple[Any, dict[str, tuple[str, Process]]]] = {}
+_registrants: dict[str, str] = {}
+"""The module that registered each id: a notebook's cell that runs again may do it again."""
 
 
 def make(env_id: str, disturbance: str = "none", **parameters: Any) -> Any:
@@ -108,20 +111,25 @@ def register(
     env_id: str,
     world: Any,
     disturbances: dict[str, Process | tuple[str, Process]] | None = None,
+    *,
+    replace: bool = False,
 ) -> None:
     """Let ``make`` and the sweep know a world by name.
 
     Args:
-        env_id: a new id.
+        env_id: a new id, or one that the calling module itself registered, which is replaced: a
+            notebook's cell may run again.
         world: a gymnax >= 1.0 environment, to which ``make`` then gives parameters and disturbances
             as it does to ours; or a function ``(disturbance, **parameters)`` that returns one and
             sees to both itself.
         disturbances: of an environment, beside "none" and ``FAULTS``: the name of each, and its
             process of the observation or its (channel, process), as `disturb` takes them.
+        replace: what another module registered under this id. Ours and gymnax's stay.
 
     Raises:
         UserError: for an id or a name that is taken, or what is no world.
     """
+    module = sys._getframe(1).f_globals.get("__name__", "")
     if not isinstance(env_id, str) or not env_id:
         raise UserError(f"an environment id must be a non-empty string, not {env_id!r}")
     is_environment = callable(getattr(world, "reset", None)) and callable(
@@ -129,15 +137,26 @@ def register(
     )
     if isinstance(world, type) or not (is_environment or callable(world)):
         raise UserError(f"the world {env_id!r} must be an environment or a function, not {world!r}")
-    if env_id in {*_constructors, *_registered, *_PROCESSES} or env_id in gymnax.registered_envs:
+    if env_id in _PROCESSES or env_id in gymnax.registered_envs:
         raise UserError(f"environment {env_id!r} exists already; choose another id")
+    if env_id in {*_constructors, *_registered} and not replace:
+        registrant = _registrants.get(env_id)
+        if registrant != module:
+            raise UserError(
+                f"environment {env_id!r} exists already, registered by {registrant}; choose "
+                "another id, or give replace=True"
+            )
     if is_environment:
         check_gymnax(world)
-        _registered[env_id] = world, _named_processes(env_id, world, disturbances or {})
+        named = _named_processes(env_id, world, disturbances or {})
+        _constructors.pop(env_id, None)
+        _registered[env_id] = world, named
     elif disturbances is not None:
         raise UserError(f"{env_id!r}: disturbances are for an environment, not for a function")
     else:
+        _registered.pop(env_id, None)
         _constructors[env_id] = world
+    _registrants[env_id] = module
 
 
 def _named_processes(

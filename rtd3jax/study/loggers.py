@@ -4,7 +4,8 @@ A lane is a run of the tracker, named as in the run directory; its metrics again
 are ``evaluation/return`` and those of learning, such as ``learning/critic_loss``. A lane that goes
 on from a checkpoint goes on in its run. Where a tracker keeps its files or sends them is for its
 own environment variables to say (``WANDB_MODE``, ``MLFLOW_TRACKING_URI``); by default all of it
-stays in the run directory.
+stays in the run directory. A tracker that cannot be opened is refused before training; one that
+fails later is let go with a warning, and the lanes go on.
 """
 
 import abc
@@ -13,11 +14,12 @@ import hashlib
 import importlib
 import importlib.util
 import os
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from rtd3jax.errors import UserError
+from rtd3jax.errors import UserError, first_line
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.rundir import RunDirectory, cell_name
 
@@ -55,9 +57,10 @@ class PerLane(abc.ABC):
             self._points(self._runs[lane], finite, row["step"])
 
     def close(self) -> None:
-        """End the runs."""
-        for run in self._runs.values():
-            self._end(run)
+        """End the runs, each also when others cannot be ended."""
+        with contextlib.ExitStack() as stack:
+            for run in self._runs.values():
+                stack.callback(self._end, run)
 
     @abc.abstractmethod
     def _begin(self, cell: Cell, seed: int) -> Any:
@@ -80,11 +83,14 @@ class TensorBoard(PerLane):
         self._make = importlib.import_module("tensorboardX").SummaryWriter
 
     def _begin(self, cell: Cell, seed: int) -> Any:
-        return self._make(str(self._path / "tensorboard" / cell_name(cell) / f"seed-{seed}"))
+        path = self._path / "tensorboard" / cell_name(cell) / f"seed-{seed}"
+        # Its queue blocks for ever where the thread that writes has died; a row never fills this.
+        return self._make(str(path), max_queue=1000)
 
     def _points(self, run: Any, values: dict[str, float], step: int) -> None:
         for name, value in values.items():
             run.add_scalar(name, value, step)
+        run.flush()  # what cannot be written is an error here, not only in the tracker's thread
 
     def _end(self, run: Any) -> None:
         run.close()
@@ -96,12 +102,16 @@ class WandB(PerLane):
     def __init__(self, directory: RunDirectory) -> None:
         super().__init__(directory)
         self._wandb = importlib.import_module("wandb")
+        self._mode = os.environ.get("WANDB_MODE", "offline")
+        if self._mode == "online" and not self._wandb.api.api_key:
+            raise UserError("WANDB_MODE is online and there is no key; run wandb login")
 
     def _begin(self, cell: Cell, seed: int) -> Any:
         name = cell_name(cell)
         run = self._wandb.init(
             project=os.environ.get("WANDB_PROJECT", self._path.resolve().name),
             id=_lane_id(self._path, name, seed),
+            mode=self._mode,
             resume="allow",
             reinit="create_new",
             dir=str(self._path),
@@ -160,16 +170,35 @@ LOGGERS: dict[str, tuple[str, Callable[[RunDirectory], Logger]]] = {
 
 
 class _Several:
-    def __init__(self, loggers: Sequence[Logger]) -> None:
+    """Loggers as one; the first exception of any of them is a warning, and it gets no more rows."""
+
+    def __init__(self, loggers: dict[str, Logger]) -> None:
         self._loggers = loggers
 
     def log(self, cell: Cell, seed: int, row: dict[str, Any]) -> None:
-        for logger in self._loggers:
-            logger.log(cell, seed, row)
+        for name, logger in list(self._loggers.items()):
+            try:
+                logger.log(cell, seed, row)
+            except Exception as error:
+                del self._loggers[name]
+                self._warn(name, error)
+                with contextlib.suppress(Exception):  # what it has may still be written
+                    logger.close()
 
     def close(self) -> None:
-        for logger in self._loggers:
-            logger.close()
+        for name, logger in self._loggers.items():
+            try:
+                logger.close()
+            except Exception as error:
+                self._warn(name, error)
+
+    @staticmethod
+    def _warn(name: str, error: Exception) -> None:
+        print(
+            f"warning: --log {name} failed and is left out from here on; training goes on: "
+            f"{first_line(error)}",
+            file=sys.stderr,
+        )
 
 
 def check_loggers(names: Sequence[str]) -> None:
@@ -186,11 +215,21 @@ def check_loggers(names: Sequence[str]) -> None:
 
 @contextlib.contextmanager
 def open_loggers(names: Sequence[str], directory: RunDirectory) -> Iterator[Logger | None]:
-    """The loggers of these names as one, closed at the end; None without names."""
+    """The loggers of these names as one, closed at the end; None without names.
+
+    Raises:
+        UserError: when one of them cannot be opened.
+    """
     if not names:
         yield None
         return
-    logger = _Several([LOGGERS[name][1](directory) for name in dict.fromkeys(names)])
+    loggers: dict[str, Logger] = {}
+    for name in dict.fromkeys(names):
+        try:
+            loggers[name] = LOGGERS[name][1](directory)
+        except Exception as error:
+            raise UserError(f"--log {name} cannot be opened: {first_line(error)}") from error
+    logger = _Several(loggers)
     try:
         yield logger
     finally:

@@ -88,8 +88,10 @@ class Recorder:
         failure = failure_of(seed, state)
         returns, true_returns = curves_of(cell.config, state, failure)
         final = np.full((2, self._directory.episodes), np.nan, np.float32)
+        interface = None
         if failure is None:
             policy = job.program.policy(job.lane, state.learner.actor)
+            interface = policy.interface()
             final = np.stack(both_returns(policy, cell.make_env(), self._directory.episodes, seed))
         else:
             self._complaints.append(
@@ -108,6 +110,7 @@ class Recorder:
             },
             metric_curves(cell.config, state, failure),
             None if failure is None else {"step": failure.step, "reason": failure.reason},
+            interface,
         )
 
 

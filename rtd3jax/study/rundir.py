@@ -20,7 +20,7 @@ from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
 from rtd3jax.files import flatten, read_arrays, user_path, write_arrays, write_bytes_atomically
 from rtd3jax.policy import FORMAT, Policy
-from rtd3jax.saved import restore_policy
+from rtd3jax.saved import read_interface, restore_policy
 from rtd3jax.study.ceilings import ceilings_of
 from rtd3jax.study.figures import final_returns, learning_curves
 from rtd3jax.study.lock import deriver, is_held
@@ -178,6 +178,7 @@ class RunDirectory:
         curves: dict[str, np.ndarray],
         metrics: dict[str, np.ndarray],
         failure: dict[str, Any] | None,
+        interface: dict[str, Any] | None = None,
     ) -> None:
         """Keep a lane that ended.
 
@@ -189,11 +190,15 @@ class RunDirectory:
                 ``final_true_returns`` [episodes].
             metrics: of learning, [K] by name.
             failure: step and reason, if the lane was lost.
+            interface: what `Policy.interface` says of its policy, which then can be loaded where
+                the cell's environment is not registered.
         """
         arrays = {f"actor.{name}": value for name, value in flatten(actor).items()}
         arrays |= {f"results.{name}": np.asarray(value) for name, value in curves.items()}
         arrays |= {f"metrics.{name}": np.asarray(value) for name, value in metrics.items()}
         about = {"format": FORMAT, "cell": cell.to_dict(), "seed": seed, "failure": failure}
+        if interface is not None:
+            about["interface"] = interface
         write_arrays(self.lane_path(cell, seed), arrays, about)
 
     def policy(self, cell: Cell, seed: int) -> Policy:
@@ -208,14 +213,19 @@ class RunDirectory:
             raise UserError(
                 f"{lane} is not trained yet in {self.path}; --status tells how far it is"
             )
-        env, path = cell.make_env(), self.lane_path(cell, seed)
+        path = self.lane_path(cell, seed)
         arrays, about = read_arrays(path)
         if about["failure"] is not None:
             raise UserError(f"{lane} was lost in training: {about['failure']['reason']}")
+        if isinstance(about.get("interface"), dict):
+            interface = read_interface(path, about["interface"])
+        else:  # of a version that did not write it
+            env = cell.make_env()
+            interface = describe(env, env.default_params)
         return restore_policy(
             path,
             {n.removeprefix("actor."): a for n, a in arrays.items() if n.startswith("actor.")},
-            describe(env, env.default_params),
+            interface,
             algorithm=cell.config.algorithm,
             history_length=cell.config.tokens,
             width=cell.config.hidden_size,

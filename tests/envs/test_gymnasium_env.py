@@ -14,6 +14,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnax.environments import environment, spaces
 
 import rtd3jax as rtd
+from rtd3jax.envs import gymnasium_env
 from rtd3jax.envs.gymnasium_env import gymnasium_id
 from rtd3jax.errors import UserError
 
@@ -188,3 +189,20 @@ def test_stable_baselines3_trains_on_it():
     ends = np.flatnonzero(model.replay_buffer.dones[:300])
     np.testing.assert_array_equal(ends, [199])
     assert model.replay_buffer.timeouts[199] == 1.0
+
+
+def test_a_forked_process_is_told_to_spawn(monkeypatch):
+    world, name = rtd.make("rover"), "rtd3jax/Rover-ar1-slip-v0"
+    env, named = rtd.to_gymnasium(world), gymnasium.make(name)
+    env.reset(seed=0)
+    monkeypatch.setattr(gymnasium_env, "_PROCESS", -1)
+    for forked in (env, rtd.to_gymnasium(world), gymnasium.make(name)):
+        assert forked.observation_space == named.observation_space
+        with pytest.raises(UserError, match='context="spawn"') as caught:
+            forked.reset(seed=0)
+        assert "\n" not in str(caught.value)
+    for call in (lambda: env.step(env.action_space.sample()), lambda: named.reset(seed=0)):
+        with pytest.raises(UserError, match="forked"):
+            call()
+    with pytest.raises(UserError, match="forked"):
+        rtd.to_gymnasium(rtd.make("pendulum"))

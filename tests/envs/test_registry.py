@@ -230,7 +230,7 @@ def test_registered_environments_are_made(monkeypatch):
     assert make("mine", "wind", speed=2) == ("wind", {"speed": 2})
     with pytest.raises(UserError, match="did you mean 'mine'"):
         make("mines")
-    for taken in ("mine", "pendulum", "Pendulum-v1"):
+    for taken in ("pendulum", "Pendulum-v1"):
         with pytest.raises(UserError, match="exists already"):
             register(taken, lambda disturbance: None)
     for unfit in (3, type(make("rover"))):
@@ -252,13 +252,36 @@ def test_a_registered_environment_gets_parameters_and_disturbances(monkeypatch):
     assert make("robot", max_steps_in_episode=7).default_params.max_steps_in_episode == 7
     with pytest.raises(UserError, match="did you mean 'noise'"):
         make("robot", "nois")
-    with pytest.raises(UserError, match="exists already"):
-        register("robot", base)
     for name in ("dropout", "none", "a+b", "a:b", ""):
         with pytest.raises(UserError, match="cannot be called"):
             register("robot2", base, {name: Delay()})
     with pytest.raises(UserError, match="element 9"):
         register("robot2", base, {"blind": Hidden(element=9)})
+
+
+def test_a_cell_that_runs_again_registers_again(monkeypatch):
+    for name in ("_constructors", "_registered", "_registrants"):
+        monkeypatch.setattr(registry, name, {})
+    base = make("PointRobot-misc")
+    cell = compile("register('robot', world, **how)", "cell", "exec")
+
+    def run(module, world, **how):
+        exec(cell, {"__name__": module, "register": register, "world": world, "how": how})
+
+    run("notebook", base, disturbances={"lag": Delay(3)})
+    with pytest.raises(UserError, match="cannot be called"):
+        run("notebook", base, disturbances={"a+b": Delay()})
+    assert make("robot", "lag").default_params.process == Delay(3), "what failed replaced nothing"
+    run("notebook", base, disturbances={"lag": Delay(5)})
+    assert make("robot", "lag").default_params.process == Delay(5)
+    run("notebook", lambda disturbance: disturbance)
+    assert make("robot", "wind") == "wind"
+    with pytest.raises(UserError, match="registered by notebook; .* replace=True"):
+        run("library", base)
+    run("library", base, replace=True)
+    assert make("robot").base is base
+    with pytest.raises(UserError, match="registered by library"):
+        run("notebook", base)
 
 
 def test_nearest_says_nothing_without_a_likeness():

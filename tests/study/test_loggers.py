@@ -105,3 +105,98 @@ def test_what_is_not_installed_is_named(monkeypatch):
     monkeypatch.setitem(loggers.LOGGERS, "wandb", ("no_such_package", None))
     with pytest.raises(UserError, match=r"pip install 'rtd3jax\[wandb\]'"):
         check_loggers(["wandb"])
+
+
+class Failing:
+    """Fails in the methods that are named."""
+
+    def __init__(self, *fails):
+        self.fails, self.calls = fails, []
+
+    def log(self, cell, seed, row):
+        self._call("log")
+
+    def close(self):
+        self._call("close")
+
+    def _call(self, name):
+        self.calls.append(name)
+        if name in self.fails:
+            raise OSError("No space left on device\nand more")
+
+
+def test_a_tracker_that_fails_is_one_warning_and_the_rest_go_on(directory, monkeypatch, capsys):
+    fakes = {"tensorboard": Failing("log", "close"), "wandb": Failing("close"), "mlflow": Failing()}
+    for name, fake in fakes.items():
+        monkeypatch.setitem(loggers.LOGGERS, name, ("json", lambda directory, fake=fake: fake))
+    with open_loggers(list(fakes), directory) as logger:
+        for _ in range(3):
+            logger.log(directory.cells[0], 0, {})
+    assert fakes["tensorboard"].calls == ["log", "close"]
+    assert fakes["wandb"].calls == fakes["mlflow"].calls == ["log"] * 3 + ["close"]
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split(" failed")[0] for line in lines] == [
+        "warning: --log tensorboard",
+        "warning: --log wandb",
+    ]
+    assert all(line.endswith("No space left on device") for line in lines)
+
+
+def test_a_tracker_that_cannot_be_opened_is_refused(directory, monkeypatch):
+    def refuse(directory):
+        raise OSError("no such host\nand more")
+
+    monkeypatch.setitem(loggers.LOGGERS, "mlflow", ("json", refuse))
+    with (
+        pytest.raises(UserError, match="--log mlflow cannot be opened: no such host$"),
+        open_loggers(["mlflow"], directory),
+    ):
+        pass
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_tensorboard_on_a_full_disk_neither_stops_nor_hangs(directory, monkeypatch, capsys):
+    writers = pytest.importorskip("tensorboardX.event_file_writer")
+
+    def refuse(self):
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(writers.EventsWriter, "flush", refuse)
+    feed("tensorboard", directory, ROWS * 10)
+    lines = capsys.readouterr().err.splitlines()
+    assert sum(line.startswith("warning: --log tensorboard failed") for line in lines) == 1
+
+
+class FakeWandb:
+    """Keeps what ``init`` was given."""
+
+    class api:  # noqa: N801
+        api_key = None
+
+    def init(self, **arguments):
+        self.arguments = arguments
+        return self
+
+    def define_metric(self, name, step_metric):
+        pass
+
+    def log(self, values):
+        pass
+
+    def finish(self):
+        pass
+
+
+def test_wandb_is_offline_unless_asked(directory, monkeypatch):
+    fake, row = FakeWandb(), {"step": 1, "return": 1.0, "metrics": {}}
+    monkeypatch.setattr(loggers.importlib, "import_module", lambda name: fake)
+    for mode in (None, "disabled"):
+        monkeypatch.delenv("WANDB_MODE", raising=False)
+        if mode:
+            monkeypatch.setenv("WANDB_MODE", mode)
+        with open_loggers(["wandb"], directory) as logger:
+            logger.log(directory.cells[0], 0, row)
+        assert fake.arguments["mode"] == (mode or "offline")
+    monkeypatch.setenv("WANDB_MODE", "online")
+    with pytest.raises(UserError, match="run wandb login"), open_loggers(["wandb"], directory):
+        pass

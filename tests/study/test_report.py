@@ -41,7 +41,8 @@ def make_run(out, grid):
             curves |= {"true_returns": curves["returns"], "final_returns": final}
             curves |= {"final_true_returns": final}
             metrics = {"critic_loss": np.array([np.nan, 2.0 + seed, 1.0], np.float32)}
-            directory.write_lane(cell, seed, policy.actor, curves, metrics, None)
+            interface = policy.interface()
+            directory.write_lane(cell, seed, policy.actor, curves, metrics, None, interface)
     chance = np.random.default_rng(1)
     references = [
         Reference(env, disturbance, "random", *chance.normal(-4, 1, (2, 3)))
