@@ -86,7 +86,9 @@ class Group:
             yield self.jobs[0], self.state
             return
         for index, job in enumerate(self.jobs):
-            yield job, jax.tree.map(lambda leaf, i=index: leaf[i], self.state)
+            with jax.debug_nans(False):  # as in `_work`
+                state = jax.tree.map(lambda leaf, i=index: leaf[i], self.state)
+            yield job, state
 
 
 def default_strategy() -> str:
@@ -225,7 +227,14 @@ class _Pool:
 
 
 def _work(pool: _Pool, device: Any, checkpoints: Checkpoints | None) -> None:
-    """A device's worker: chunks of the lagging group, as long as there is one."""
+    """A device's worker."""
+    # jax_debug_nans would take our own NaN for a fault: points of curves that are not reached yet.
+    with jax.debug_nans(False):
+        _train(pool, device, checkpoints)
+
+
+def _train(pool: _Pool, device: Any, checkpoints: Checkpoints | None) -> None:
+    """Chunks of the lagging group, as long as there is one."""
     rates: dict[Any, float] = {}
     while (group := pool.take()) is not None:
         try:

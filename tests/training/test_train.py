@@ -151,3 +151,16 @@ def test_several_configurations_are_trained_as_each_alone(tmp_path):
     np.testing.assert_array_equal(again[1].returns, together[1].returns)
     with pytest.raises(rtd.UserError, match="rtd.Config, or several"):
         rtd.train(env, [], progress=False)
+
+
+def test_jax_debug_nans_does_not_end_a_training():
+    """Curves are NaN where they are not reached yet; those are ours."""
+    config = rtd.Config(
+        "td3", total_steps=40, hidden_size=4, batch_size=4, learning_starts=10, eval_every=20
+    )
+    jax.config.update("jax_debug_nans", True)
+    try:
+        run = rtd.train(rtd.make("rover"), config, seeds=[0, 1], progress=False, strategy="vmap")
+    finally:
+        jax.config.update("jax_debug_nans", False)
+    assert not run.failures
