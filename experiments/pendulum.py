@@ -249,7 +249,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--run", type=pathlib.Path, default=pathlib.Path("runs/pendulum"))
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
     parser.add_argument(
-        "--steps", type=int, default=presets.PENDULUM_STEPS, help="h-td3 has three times as many"
+        "--steps", type=int, default=presets.PENDULUM_STEPS, help="h-td3 has twice as many"
     )
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument(
@@ -262,8 +262,8 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     began, more, episodes = time.time(), [], TEST_EPISODES
     if options.quick:
-        options.steps, options.seeds, options.lengths, options.width = 40, 1, [1], 4
-        more = ["--batch-size=4", "--learning-starts=10", "--eval-every=40", "--eval-episodes=1"]
+        options.steps, options.seeds, options.lengths, options.width = 60, 1, [1], 4
+        more = ["--learning-starts=50", "--eval-every=60", "--eval-episodes=1"]
         more += ["--final-episodes=1", "--quiet", "--no-report"]
         options.disturbances, episodes = options.disturbances or ["random-sine"], 2
     runs = []

@@ -155,9 +155,10 @@ def test_presets_have_the_settings_that_were_searched():
         length = {"history_length": 0 if algorithm == "td3" else 1}
         assert len(settings("rover", algorithm)) == 3
         assert all(found | rover | length == found for found in settings("rover", algorithm))
-        pendulum = {**presets.PENDULUM_SETTINGS, "total_steps": 40_000}
+        pendulum = {**presets.PENDULUM_SETTINGS, "total_steps": 30_000}
         if algorithm == "h-td3":
-            pendulum |= {"exploration_noise": 0.5, "policy_delay": 4, "total_steps": 120_000}
+            pendulum |= {"exploration_noise": 0.5, "policy_delay": 4, "total_steps": 60_000}
+            pendulum |= {"update_every": 1, "actor_learning_rate": 3e-4, "tau": 0.005}
         assert all(found | pendulum == found for found in settings("pendulum", algorithm))
         # What is said on the command line is for all of them.
         given = {"total_steps": 2_000, "policy_delay": 3}

@@ -157,6 +157,15 @@ def check_memory(name: str, memory: Memory) -> None:
         )
 
 
+def draw_uniform(key: jax.Array, shapes: dict[str, tuple[int, ...]], bound: float) -> Params:
+    """Arrays of these shapes, uniform in ±``bound``; ``key`` is consumed here."""
+    keys = jax.random.split(key, len(shapes))
+    return {
+        name: jax.random.uniform(k, shape, jnp.float32, -bound, bound)
+        for k, (name, shape) in zip(keys, shapes.items(), strict=True)
+    }
+
+
 def _shapes(tree: Any) -> tuple[Any, list[str]]:
     leaves, structure = jax.tree.flatten(tree)
     return structure, [f"{leaf.dtype}{list(leaf.shape)}" for leaf in leaves]

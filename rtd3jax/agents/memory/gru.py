@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from rtd3jax.agents.memory.base import Memory, Params
+from rtd3jax.agents.memory.base import Memory, Params, draw_uniform
 from rtd3jax.agents.products import matmul
 
 
@@ -22,18 +22,14 @@ class GRU(Memory):
 
     def initial(self, key: jax.Array) -> Params:
         """Uniform in ±1/sqrt(H)."""
-        bound, width = self.width**-0.5, self.width
+        width = self.width
         shapes = {
             "input_kernel": (self.inputs, 3 * width),
             "recurrent_kernel": (width, 3 * width),
             "input_bias": (3 * width,),
             "recurrent_bias": (3 * width,),
         }
-        keys = jax.random.split(key, len(shapes))
-        return {
-            name: jax.random.uniform(k, shape, jnp.float32, -bound, bound)
-            for k, (name, shape) in zip(keys, shapes.items(), strict=True)
-        }
+        return draw_uniform(key, shapes, width**-0.5)
 
     def zero(self, batch: int) -> jax.Array:
         """Zeros [B, H]."""

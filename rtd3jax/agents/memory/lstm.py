@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from rtd3jax.agents.memory.base import Memory
+from rtd3jax.agents.memory.base import Memory, draw_uniform
 from rtd3jax.agents.products import matmul, narrow, product, weight_gradient
 
 Params = dict[str, jax.Array]
@@ -30,18 +30,13 @@ class Carry(NamedTuple):
 
 def init_lstm(key: jax.Array, inputs: int, width: int) -> Params:
     """Parameters, uniform in ±1/sqrt(width), with two bias vectors. Gates stand as i, f, g, o."""
-    bound = width**-0.5
     shapes = {
         "input_kernel": (inputs, 4 * width),
         "recurrent_kernel": (width, 4 * width),
         "input_bias": (4 * width,),
         "recurrent_bias": (4 * width,),
     }
-    keys = jax.random.split(key, len(shapes))
-    return {
-        name: jax.random.uniform(k, shape, jnp.float32, -bound, bound)
-        for k, (name, shape) in zip(keys, shapes.items(), strict=True)
-    }
+    return draw_uniform(key, shapes, width**-0.5)
 
 
 _ARRAYS = ("input_kernel", "recurrent_kernel", "input_bias", "recurrent_bias")

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from rtd3jax.agents.memory.base import Memory, Params
+from rtd3jax.agents.memory.base import Memory, Params, draw_uniform
 from rtd3jax.agents.products import matmul
 
 
@@ -24,12 +24,9 @@ class MinGRU(Memory):
 
     def initial(self, key: jax.Array) -> Params:
         """Uniform in ±1/sqrt(I)."""
-        bound, width = self.inputs**-0.5, 2 * self.width
-        kernel, bias = jax.random.split(key)
-        return {
-            "kernel": jax.random.uniform(kernel, (self.inputs, width), jnp.float32, -bound, bound),
-            "bias": jax.random.uniform(bias, (width,), jnp.float32, -bound, bound),
-        }
+        width = 2 * self.width
+        shapes = {"kernel": (self.inputs, width), "bias": (width,)}
+        return draw_uniform(key, shapes, self.inputs**-0.5)
 
     def zero(self, batch: int) -> jax.Array:
         """Zeros [B, H]."""
