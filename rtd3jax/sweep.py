@@ -17,17 +17,16 @@ import jax
 
 from rtd3jax.errors import UserError
 from rtd3jax.study import options as given
-from rtd3jax.study.ceilings import compute_ceilings
 from rtd3jax.study.cluster import train_on_cluster
 from rtd3jax.study.command import exit_status, import_worlds
 from rtd3jax.study.execute import Work, train_here
+from rtd3jax.study.finish import finish
 from rtd3jax.study.hosts import own_shard, own_share, relaunch
 from rtd3jax.study.lock import parse_shard, writer
 from rtd3jax.study.loggers import check_loggers, open_loggers
 from rtd3jax.study.memory import lanes_at_once, memory
 from rtd3jax.study.plan import cell_jobs, make_cells, plan_text
 from rtd3jax.study.references import references_of
-from rtd3jax.study.report.page import refresh_page
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.training.lanes import Job, workers
 from rtd3jax.training.run import check_strategy
@@ -133,13 +132,7 @@ def _train(
                 train_here(directory, jobs, work, complaints, references, logger)
         except KeyboardInterrupt as interrupt:
             interrupted = 143 if isinstance(interrupt, _Terminated) else 130
-    # Of several processes the last to end has the rest to do.
-    complete = options.report and directory.has_ended() and not interrupted
-    if complete:
-        compute_ceilings(directory.path, directory.cells)
-    directory.derive(references)
-    if options.report:
-        refresh_page(directory, complete=complete)
+    finish(directory, references, page=options.report, interrupted=bool(interrupted))
     print((directory.path / "summary.md").read_text("utf-8"))
     print(f"results: {directory.path}")
     if interrupted:

@@ -11,7 +11,7 @@ from rtd3jax import sweep
 from rtd3jax.agents.variants import ALGORITHMS
 from rtd3jax.config import Config
 from rtd3jax.envs import registry
-from rtd3jax.study import presets, recorder, references
+from rtd3jax.study import finish, presets, recorder, references
 from rtd3jax.study.plan import Cell, Grid, make_cells
 from rtd3jax.study.presets import PRESETS
 from rtd3jax.study.results import CURVES, EPISODES, read_table
@@ -27,7 +27,7 @@ TINY = [
 @pytest.fixture(autouse=True)
 def few_reference_episodes(monkeypatch):
     monkeypatch.setattr(references, "EPISODES", 2)
-    monkeypatch.setattr(sweep, "refresh_page", lambda *_, **__: None)
+    monkeypatch.setattr(finish, "refresh_page", lambda *_, **__: None)
 
 
 def _files(directory, *names):
@@ -37,7 +37,7 @@ def _files(directory, *names):
 def test_a_run_directory_holds_what_it_should(tmp_path, capsys, monkeypatch):
     out = tmp_path / "run"
     pages = []
-    monkeypatch.setattr(sweep, "refresh_page", lambda run, complete: pages.append(complete))
+    monkeypatch.setattr(finish, "refresh_page", lambda run, complete: pages.append(complete))
     assert sweep.main([*TINY, "--out", str(out)]) == 0
     assert pages == [True]
     curves = read_table(out / "curves.parquet", CURVES)

@@ -13,7 +13,7 @@ import jax
 import pytest
 
 from rtd3jax import sweep
-from rtd3jax.study import recorder, references
+from rtd3jax.study import finish, recorder, references
 from rtd3jax.study.rundir import LOG, RunDirectory, read_log
 
 STUDY = [
@@ -28,7 +28,7 @@ TABLES = "curves.parquet", "episodes.parquet", "summary.md"
 @pytest.fixture(autouse=True)
 def few_reference_episodes(monkeypatch):
     monkeypatch.setattr(references, "EPISODES", 2)
-    monkeypatch.setattr(sweep, "refresh_page", lambda *_, **__: None)
+    monkeypatch.setattr(finish, "refresh_page", lambda *_, **__: None)
 
 
 def run(out, *more):
@@ -44,7 +44,7 @@ def contents(out):
 def whole(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(references, "EPISODES", 2)
-        patch.setattr(sweep, "refresh_page", lambda *_, **__: None)
+        patch.setattr(finish, "refresh_page", lambda *_, **__: None)
         out = tmp_path_factory.mktemp("whole") / "run"
         assert run(out) == 0
     return out

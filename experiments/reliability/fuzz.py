@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 
 import rtd3jax as rtd
 from rtd3jax import sweep
-from rtd3jax.study import references, rundir
+from rtd3jax.study import finish, references, rundir
 
 FIELDS = [field.name for field in dataclasses.fields(rtd.Config)]
 VALUES = st.one_of(
@@ -152,7 +152,7 @@ def main(arguments: list[str] | None = None) -> int:
         mock.patch.object(references, "EPISODES", 1),
         mock.patch.object(rundir, "learning_curves"),  # pictures take seconds each
         mock.patch.object(rundir, "final_returns"),
-        mock.patch.object(sweep, "refresh_page"),
+        mock.patch.object(finish, "refresh_page"),
     ):
         warnings.simplefilter("ignore")
         fields = st.dictionaries(st.sampled_from(FIELDS), VALUES, max_size=4)

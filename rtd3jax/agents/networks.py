@@ -172,24 +172,24 @@ def make_network(
     Raises:
         UserError: when the memory or the encoder does not keep to its interface.
     """
+
+    def first_layer(parts: tuple[str, ...]) -> nn.Module:
+        module = encoder(inputs=sum(sizes[part] for part in parts), outputs=width)
+        _check_encoder(module, width)
+        return module
+
     modules: dict[str, Any] = {}
     features = 0
     if reads.memory:
-        inputs = sum(sizes[part] for part in reads.memory)
-        modules["encoder"] = encoder(inputs=inputs, outputs=width)
+        modules["encoder"] = first_layer(reads.memory)
         modules["memory"] = MEMORIES[memory](inputs=width, width=width, precision=precision)
         check_memory(memory, modules["memory"])
         features += width
     if reads.current:
-        inputs = sum(sizes[part] for part in reads.current)
-        modules["current"] = encoder(inputs=inputs, outputs=width)
+        modules["current"] = first_layer(reads.current)
         features += width
     head, output = Linear(features, width, precision), Linear(width, outputs)
-    network = Network(reads=reads, head=head, output=output, **modules)
-    for name in ("encoder", "current"):
-        if name in modules:
-            _check_encoder(modules[name], width)
-    return network
+    return Network(reads=reads, head=head, output=output, **modules)
 
 
 def init_network(key: jax.Array, network: Network) -> Params:

@@ -18,15 +18,16 @@ import pandas as pd
 from rtd3jax.errors import UserError
 from rtd3jax.files import user_path
 from rtd3jax.policy import Policy
-from rtd3jax.study.ceilings import ceilings_of, compute_ceilings
+from rtd3jax.study.ceilings import ceilings_of
 from rtd3jax.study.execute import Work, train_here
 from rtd3jax.study.figures import final_returns, learning_curves
+from rtd3jax.study.finish import finish
 from rtd3jax.study.lock import writer
 from rtd3jax.study.loggers import check_loggers, open_loggers
 from rtd3jax.study.memory import lanes_at_once, memory
 from rtd3jax.study.plan import Cell, cell_jobs
 from rtd3jax.study.references import references_of
-from rtd3jax.study.report.page import refresh_page, write_page
+from rtd3jax.study.report.page import write_page
 from rtd3jax.study.results import CURVES, EPISODES, METRICS, read_table
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.training.lanes import workers
@@ -94,14 +95,13 @@ class Study:
         complaints: list[str] = []
         references = references_of(directory.cells)
         with writer(directory.path, None):
+            ended = False
             try:
                 with open_loggers(log, directory) as logger:
                     train_here(directory, jobs, work, complaints, references, logger)
+                ended = True
             finally:
-                directory.derive(references)
-            if page:
-                compute_ceilings(directory.path, directory.cells)
-                refresh_page(directory, complete=True)
+                finish(directory, references, page=page, interrupted=not ended)
         return complaints
 
     def status(self) -> pd.DataFrame:
