@@ -14,8 +14,11 @@ from rtd3jax.errors import UserError, nearest
 from rtd3jax.registries import AGENTS, MEMORIES
 
 PRECISIONS = ("float32", "bfloat16")
+REPLAYS = ("windows", "segments")
+ACTINGS = ("window", "carry")
 
 DEFAULT_HISTORY_LENGTH = 10
+DEFAULT_SEGMENT_LENGTH = 10
 
 
 def _field(default: Any, help: str, *, traced: bool = False, low: float, high: float = math.inf):
@@ -26,6 +29,13 @@ def _field(default: Any, help: str, *, traced: bool = False, low: float, high: f
     return dataclasses.field(
         default=default, metadata={"help": help, "traced": traced, "low": low, "high": high}
     )
+
+
+WINDOWS_WITH_CARRY = (
+    "acting='carry' with replay='windows': a memory that was trained on windows has never seen a "
+    "carry older than its window, and its returns fall; train with replay='segments', or act with "
+    "windows"
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,6 +110,35 @@ class Config:
         default="lstm",
         metadata={"help": "the recurrent cell: lstm (the paper's), gru, min-gru, or your own"},
     )
+    replay: str = dataclasses.field(
+        default="windows",
+        metadata={
+            "help": "what a batch is cut into: windows (the paper's), a history for each "
+            "transition; or segments, whose tokens serve all the transitions after them: faster "
+            "the longer the history"
+        },
+    )
+    segment_length: int | None = _field(
+        None,
+        "consecutive transitions in a segment; divides batch_size "
+        f"[the largest divisor up to {DEFAULT_SEGMENT_LENGTH}; 0 with windows]",
+        low=0,
+    )
+    burn_in_gradient: bool = dataclasses.field(
+        default=True,
+        metadata={
+            "help": "whether a segment's gradient flows back into its burn-in, the history_length "
+            "steps before it"
+        },
+    )
+    acting: str | None = dataclasses.field(
+        default=None,
+        metadata={
+            "help": "how the agent acts: window reads the last steps anew at every step; carry "
+            "goes on with the memory's carry from the episode's start [carry with segments, else "
+            "window]"
+        },
+    )
     precision: str = dataclasses.field(
         default="float32",
         metadata={
@@ -118,6 +157,7 @@ class Config:
                 f"; there are {' and '.join(PRECISIONS)}"
             )
         self._resolve_history_length()
+        self._resolve_replay()
         for field in dataclasses.fields(self):
             if "low" in field.metadata:
                 object.__setattr__(self, field.name, self._checked(field))
@@ -129,6 +169,8 @@ class Config:
                 f"({self.learning_starts}): the first update would have too few transitions; "
                 "raise learning_starts or lower batch_size"
             )
+        if self.replay == "segments":
+            self._check_segments()
         window = 1 + self.tokens
         if capacity < max(self.batch_size, window):
             raise UserError(
@@ -147,6 +189,54 @@ class Config:
             object.__setattr__(self, "history_length", 0)
         elif self.history_length is None:
             object.__setattr__(self, "history_length", DEFAULT_HISTORY_LENGTH)
+
+    def _resolve_replay(self) -> None:
+        """Fill in how a batch is cut and how the agent acts; without a history neither matters."""
+        for name, choices in (("replay", REPLAYS), ("acting", (*ACTINGS, None))):
+            value = getattr(self, name)
+            if value not in choices:
+                named = [choice for choice in choices if choice]
+                raise UserError(
+                    f"{name} {value!r} is unknown{nearest(str(value), named)}; there are "
+                    f"{' and '.join(named)}"
+                )
+        if not isinstance(self.burn_in_gradient, bool):
+            raise UserError(
+                f"burn_in_gradient must be True or False, not {self.burn_in_gradient!r}"
+            )
+        segments = self.replay == "segments" and self.has_window
+        resolved: dict[str, Any] = {"replay": "segments" if segments else "windows"}
+        if self.acting is None or not self.has_window:
+            resolved["acting"] = "carry" if segments else "window"
+        elif self.acting == "carry" and not segments:
+            warnings.warn(WINDOWS_WITH_CARRY, stacklevel=4)
+        if not segments:
+            if self.segment_length and self.has_window:
+                raise UserError(
+                    f"segment_length={self.segment_length} needs replay='segments'; with windows "
+                    "every transition has a history of its own"
+                )
+            resolved["segment_length"] = 0
+        elif self.segment_length is None and isinstance(self.batch_size, int):
+            divisors = range(1, DEFAULT_SEGMENT_LENGTH + 1)
+            resolved["segment_length"] = max(m for m in divisors if self.batch_size % m == 0)
+        for name, value in resolved.items():
+            object.__setattr__(self, name, value)
+
+    def _check_segments(self) -> None:
+        length = self.segment_steps
+        if length < 1:
+            raise UserError(f"segment_length must be at least 1, not {length}")
+        if self.batch_size % length:
+            raise UserError(
+                f"segment_length ({length}) does not divide batch_size ({self.batch_size}); a "
+                "batch is whole segments: choose another of the two"
+            )
+        if length > self.capacity:
+            raise UserError(
+                f"segment_length ({length}) is longer than the replay ({self.capacity}); lower it, "
+                "or raise replay_capacity"
+            )
 
     def _checked(self, field: dataclasses.Field) -> Any:
         value = getattr(self, field.name)
@@ -177,6 +267,17 @@ class Config:
         """Past tokens in a window: l, and 0 for an agent without one."""
         assert self.history_length is not None  # resolved when it was made
         return self.history_length
+
+    @property
+    def runs_on(self) -> bool:
+        """Whether the agent acts with a carry that runs on from the episode's start."""
+        return self.acting == "carry"
+
+    @property
+    def segment_steps(self) -> int:
+        """Consecutive transitions in a segment, m; 0 with windows."""
+        assert self.segment_length is not None  # resolved when it was made
+        return self.segment_length
 
     @property
     def capacity(self) -> int:

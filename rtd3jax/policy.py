@@ -14,9 +14,9 @@ from flax import struct
 
 from rtd3jax.agents.agent import make_part
 from rtd3jax.agents.bounds import Bounds
-from rtd3jax.agents.history import Steps, empty_steps, put_step, window_at
-from rtd3jax.agents.memory.base import Params
-from rtd3jax.agents.networks import Network, act
+from rtd3jax.agents.history import Steps, empty_steps, present, put_step, window_at
+from rtd3jax.agents.memory.base import Carry, Params
+from rtd3jax.agents.networks import Network, act, advance
 from rtd3jax.deploy.formats import writer_of
 from rtd3jax.deploy.model import Model, fold
 from rtd3jax.envs.entry import parameters_of
@@ -31,6 +31,9 @@ FORMAT = 2
 
 Actors of format 1 read actions in the environment's units."""
 
+CARRY_FORMAT = 3
+"""Of saved policies that act with a running carry; else as `FORMAT`."""
+
 KIND = "policy"
 
 
@@ -39,14 +42,16 @@ class PolicyState:
     """What a policy remembers within an episode.
 
     Attributes:
-        steps: ring of the last L steps.
+        steps: ring of the last L steps; None where a carry runs on.
         previous_action: [A], as tokens hold it; zero before the first step.
         time: int32 [], steps done in the episode.
+        carry: the memory's, leaves [1, ...], where it runs on from the episode's start; else None.
     """
 
-    steps: Steps
+    steps: Steps | None
     previous_action: jax.Array
     time: jax.Array
+    carry: Carry | None = None
 
 
 @struct.dataclass
@@ -64,6 +69,8 @@ class Policy:
         observation_size: O.
         action_shape: shape of the environment's action.
         memory: the name of its recurrent cell.
+        acting: ``window`` reads the last l steps at every step; ``carry`` goes on with the memory's
+            carry from the episode's start, which costs one token whatever l is.
     """
 
     actor: Params
@@ -75,6 +82,7 @@ class Policy:
     observation_size: int = struct.field(pytree_node=False)
     action_shape: tuple[int, ...] = struct.field(pytree_node=False)
     memory: str = struct.field(pytree_node=False, default="lstm")
+    acting: str = struct.field(pytree_node=False, default="window")
 
     @property
     def width(self) -> int:
@@ -90,10 +98,14 @@ class Policy:
     def init(self, key: jax.Array | None = None) -> PolicyState:
         """The state before an episode's first step; ``key`` is not needed."""
         action_size = self.bounds.low.shape[0]
+        runs_on = self.acting == "carry"
         return PolicyState(
-            steps=empty_steps(max(self.tokens, 1), self.observation_size, action_size),
+            steps=None
+            if runs_on
+            else empty_steps(max(self.tokens, 1), self.observation_size, action_size),
             previous_action=jnp.zeros((action_size,), jnp.float32),
             time=jnp.int32(0),
+            carry=self.network.zero_carry(1) if runs_on else None,
         )
 
     def step(self, state: PolicyState, observation: jax.Array) -> tuple[jax.Array, PolicyState]:
@@ -139,6 +151,8 @@ class Policy:
         )
 
     def _step(self, state: PolicyState, observation: jax.Array) -> tuple[jax.Array, PolicyState]:
+        if state.steps is None:
+            return self._step_with_carry(state, observation)
         time = state.time[None]
         window = window_at(
             state.steps,
@@ -154,6 +168,18 @@ class Policy:
         token = action + self.centre_token
         steps = put_step(state.steps, state.time, Steps(observation, state.previous_action, token))
         state = PolicyState(steps, token, state.time + jnp.int32(1))
+        return self.bounds.to_environment(action).reshape(self.action_shape), state
+
+    def _step_with_carry(
+        self, state: PolicyState, observation: jax.Array
+    ) -> tuple[jax.Array, PolicyState]:
+        network, window = self.network, present(observation[None], state.previous_action[None])
+        action = act(network, self.actor, window, state.carry)[0]
+        token = action + self.centre_token
+        carry = state.carry
+        if carry is not None:
+            carry = advance(network, self.actor, window, token[None], carry)
+        state = PolicyState(None, token, state.time + jnp.int32(1), carry)
         return self.bounds.to_environment(action).reshape(self.action_shape), state
 
     def save(self, path: str | os.PathLike, overwrite: bool = False) -> None:
@@ -194,6 +220,7 @@ class Policy:
             cell=cell,
             network=self.network,
             params=actor,
+            acting=self.acting,
         )
         write_new(path, content_of(model), overwrite)
 
@@ -220,13 +247,14 @@ class Policy:
         """The header of a file that holds the policy."""
         return {
             "kind": KIND,
-            "format": FORMAT,
+            "format": CARRY_FORMAT if self.acting == "carry" else FORMAT,
             "algorithm": self.algorithm,
             "history_length": int(self.history_length),
             **self.interface(),
             "centre_token": np.asarray(self.centre_token).tolist(),
             "hidden_size": self.width,
             "memory": self.memory,
+            "acting": self.acting,
             "versions": versions_of(("rtd3jax", "jax", "jaxlib", "numpy")),
         }
 

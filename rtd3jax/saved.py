@@ -15,13 +15,14 @@ from rtd3jax.agents.agent import make_part
 from rtd3jax.agents.bounds import Bounds
 from rtd3jax.agents.memory.base import Params
 from rtd3jax.agents.networks import NetworkSpec, init_network, part_sizes
+from rtd3jax.config import ACTINGS
 from rtd3jax.envs.interface import Interface
 from rtd3jax.errors import UserError
 from rtd3jax.files import flatten, read_arrays, unflatten
-from rtd3jax.policy import FORMAT, KIND, Policy
+from rtd3jax.policy import CARRY_FORMAT, FORMAT, KIND, Policy
 from rtd3jax.registries import AGENTS, MEMORIES
 
-_FORMATS = (1, FORMAT)
+_FORMATS = (1, FORMAT, CARRY_FORMAT)
 _ACTIONS = ("action", "previous_action")
 _OLD_NAME = re.compile(r"^lstm\.")
 """How the memory's arrays began when the LSTM was the only one."""
@@ -45,8 +46,7 @@ def read_policy(path: str | os.PathLike) -> Policy:
     if about.get("format") not in _FORMATS:
         raise UserError(
             f"{path} has format {about.get('format')}, and this version of rtd3jax reads up to "
-            f"{FORMAT}: "
-            "use the version that wrote it, or a newer one"
+            f"{CARRY_FORMAT}: use the version that wrote it, or a newer one"
         )
     interface, facts = _header(path, about)
     return restore_policy(path, arrays, interface, **facts)
@@ -61,6 +61,7 @@ def restore_policy(
     history_length: int,
     width: int,
     memory: str = "lstm",
+    acting: str = "window",
     format: int = FORMAT,
     centre_token: np.ndarray | None = None,
 ) -> Policy:
@@ -74,6 +75,7 @@ def restore_policy(
         history_length: l; 0 for td3.
         width: H.
         memory: the name of its recurrent cell.
+        acting: ``window`` or ``carry``, as in the policy.
         format: of the file; an actor of format 1 is converted.
         centre_token: [A], as in the policy; zero by default.
 
@@ -121,6 +123,7 @@ def restore_policy(
         observation_size=interface.observation_size,
         action_shape=interface.action_shape,
         memory=memory,
+        acting=acting,
     )
 
 
@@ -155,6 +158,9 @@ def _header(path: str | os.PathLike, about: dict[str, Any]) -> tuple[Interface, 
             f"{path}: the memory {memory!r} is not known here, only {', '.join(MEMORIES)}; "
             "register yours with rtd.register_memory before you load it"
         )
+    acting = about.get("acting", "window")
+    if acting not in ACTINGS:
+        raise UserError(f"{wrong} acting is {acting!r}, not {' or '.join(ACTINGS)}")
     windowed = AGENTS[algorithm].has_window
     lowest = {"hidden_size": 1, "history_length": windowed}
     for name, least in lowest.items():
@@ -170,6 +176,7 @@ def _header(path: str | os.PathLike, about: dict[str, Any]) -> tuple[Interface, 
         "centre_token": centre_token,
         "algorithm": algorithm,
         "memory": memory,
+        "acting": acting,
         "history_length": about["history_length"],
         "width": about["hidden_size"],
     }

@@ -14,7 +14,9 @@ from rtd3jax.registries import AGENTS
 LENGTH = 3
 
 
-def random_policy(algorithm, env, *, width=8, length=LENGTH, seed=0, scale=3.0, memory="lstm"):
+def random_policy(
+    algorithm, env, *, width=8, length=LENGTH, seed=0, scale=3.0, memory="lstm", acting="window"
+):
     """An untrained policy whose weights before the output are ``scale`` times their usual size."""
     interface = describe(env, env.default_params)
     length = 0 if algorithm == "td3" else length
@@ -39,4 +41,5 @@ def random_policy(algorithm, env, *, width=8, length=LENGTH, seed=0, scale=3.0, 
         observation_size=interface.observation_size,
         action_shape=interface.action_shape,
         memory=memory,
+        acting=acting,
     )

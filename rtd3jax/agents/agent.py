@@ -17,12 +17,13 @@ from rtd3jax.agents.memory.base import Carry, Memory, Params
 from rtd3jax.agents.networks import (
     Network,
     act,
+    advance,
     carry_before,
     init_network,
     make_network,
     part_sizes,
 )
-from rtd3jax.agents.replay import Batch, Replay, empty_replay, sample
+from rtd3jax.agents.replay import Batch, Replay, empty_replay, sample, sample_segments
 from rtd3jax.agents.variants import Variant
 from rtd3jax.config import Config
 from rtd3jax.registries import AGENTS, LEARNERS, MEMORIES
@@ -63,14 +64,19 @@ class Agent:
     action_size: int
 
     @property
-    def tokens(self) -> int:
-        """Past tokens in a window's arrays."""
-        return self.config.tokens
-
-    @property
     def metrics(self) -> tuple[str, ...]:
         """Names of what `update` measures."""
         return self.learner.metrics
+
+    @property
+    def has_running_carry(self) -> bool:
+        """Whether it acts with a carry that runs on from the episode's start, without a window."""
+        return self.config.runs_on
+
+    @property
+    def acting_tokens(self) -> int:
+        """Past tokens in the arrays of the window that it acts upon."""
+        return 0 if self.has_running_carry else self.config.tokens
 
     def init(self, key: jax.Array) -> Any:
         """The learner's state at the start; its ``actor`` is the actor's parameters."""
@@ -81,12 +87,33 @@ class Agent:
         carry = self.acting.zero_carry(1) if self.variant.stores_carry else None
         return empty_replay(self.config.capacity, self.observation_size, self.action_size, carry)
 
-    def act(self, actor: Params, window: Window) -> tuple[jax.Array, Carry | None]:
-        """The deterministic action [B, A], and the carry that replay keeps, if it does."""
-        carry = None
-        if self.variant.stores_carry:
+    def zero_carry(self) -> Carry | None:
+        """The running carry, leaves [1, ...], before an episode's first step; None with windows."""
+        return self.acting.zero_carry(1) if self.has_running_carry else None
+
+    def act(
+        self, actor: Params, window: Window, running: Carry | None
+    ) -> tuple[jax.Array, Carry | None]:
+        """The deterministic action [B, A], and the carry that replay keeps, if it does.
+
+        Args:
+            actor: its parameters.
+            window: of the step; without past tokens where a carry runs on.
+            running: that carry, before the step; None with windows.
+        """
+        carry = running
+        if carry is None and self.variant.stores_carry:
             carry = carry_before(self.acting, actor, window)
-        return act(self.acting, actor, window, carry), carry
+        kept = carry if self.variant.stores_carry else None
+        return act(self.acting, actor, window, carry), kept
+
+    def carry_after(
+        self, actor: Params, window: Window, action: jax.Array, running: Carry | None
+    ) -> Carry | None:
+        """The running carry after a step at which ``action`` [B, A] was done; None with windows."""
+        if running is None:
+            return None
+        return advance(self.acting, actor, window, action, running)
 
     def final_carry(
         self,
@@ -104,8 +131,11 @@ class Agent:
         self, replay: Replay, key: jax.Array, count: jax.Array, history_length: jax.Array
     ) -> Batch:
         """A batch of the ``count`` steps written so far."""
-        size = self.config.batch_size
-        return sample(replay, key, count, size, self.tokens, history_length)
+        config = self.config
+        rows = replay, key, count, config.batch_size, config.tokens, history_length
+        if config.replay == "segments":
+            return sample_segments(*rows, config.segment_steps, config.burn_in_gradient)
+        return sample(*rows)
 
     def update(
         self,

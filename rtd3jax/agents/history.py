@@ -2,10 +2,11 @@
 
 One function, `window_at`, serves acting, replay, evaluation and deployment. Its invariant: the
 tokens that exist are the last of the window. What is before an episode's first step, before the
-oldest step kept, or beyond the history length does not exist; it is not a zero token.
+oldest step kept, or beyond the history length does not exist; it is not a zero token. `segment_at`
+cuts a stretch of steps instead, whose tokens are read once for all of them.
 
-Shapes: ``C`` capacity of the ring, ``L`` past tokens, ``B`` batch, ``O`` and ``A`` sizes of an
-observation and an action.
+Shapes: ``C`` capacity of the ring, ``L`` past tokens, ``B`` batch, ``M`` segments of ``m`` steps,
+``O`` and ``A`` sizes of an observation and an action.
 """
 
 import jax
@@ -49,6 +50,66 @@ class Window:
         """Which of the past tokens exist: bool [L, B]."""
         offset = jnp.arange(self.past.action.shape[0], 0, -1, dtype=jnp.int32)
         return offset[:, None] <= self.length[None, :]
+
+
+@struct.dataclass
+class Segment:
+    """What a network may read at m consecutive steps in each of M places: B = M m steps.
+
+    Every token serves all the steps after it, where a window has tokens for one step alone. The
+    steps [m, M] lie flat, one place after the other within a step's number.
+
+    Attributes:
+        steps: leaves [T, M, ...], T = L + m: the burn-in, then the m steps themselves.
+        starts: bool [T, M], tokens before which there is no history: an episode's first, the oldest
+            step kept, and the first that the history length lets in.
+        observation: [B, O], the current observation.
+        previous_action: [B, A], the action before it; zero at an episode's first step.
+        following: whether the current step is the one after each of the m steps.
+        burn_in_gradient: whether a gradient flows back into the burn-in.
+    """
+
+    steps: Steps
+    starts: jax.Array
+    observation: jax.Array
+    previous_action: jax.Array
+    following: bool = struct.field(pytree_node=False)
+    burn_in_gradient: bool = struct.field(pytree_node=False)
+
+    @property
+    def length(self) -> int:
+        """m."""
+        return self.observation.shape[0] // self.starts.shape[1]
+
+    @property
+    def action(self) -> jax.Array:
+        """[B, A], what was done at the m steps."""
+        return flat(self.steps.action[-self.length :])
+
+    @property
+    def present(self) -> Window:
+        """The current step alone: a window without past tokens."""
+        return present(self.observation, self.previous_action)
+
+
+History = Window | Segment
+"""What a network may read at each step of a batch."""
+
+
+def flat(rows: jax.Array) -> jax.Array:
+    """[m, M, ...] as [m M, ...]."""
+    return rows.reshape(-1, *rows.shape[2:])
+
+
+def present(observation: jax.Array, previous_action: jax.Array) -> Window:
+    """The window without past tokens: ``observation`` [B, O] after ``previous_action`` [B, A]."""
+    batch = observation.shape[0]
+    past = Steps(
+        observation=jnp.zeros((0, *observation.shape), jnp.float32),
+        previous_action=jnp.zeros((0, *previous_action.shape), jnp.float32),
+        action=jnp.zeros((0, *previous_action.shape), jnp.float32),
+    )
+    return Window(past, jnp.zeros((batch,), jnp.int32), observation, previous_action)
 
 
 def empty_steps(capacity: int, observation_size: int, action_size: int) -> Steps:
@@ -100,6 +161,46 @@ def window_at(
     oldest = jnp.maximum(count - capacity, 0)
     length = _limited(jnp.minimum(age, number - oldest), tokens, history_length)
     return Window(past, length, observation, previous_action)
+
+
+def segment_at(
+    ring: Steps,
+    ages: jax.Array,
+    first: jax.Array,
+    count: jax.Array,
+    tokens: int,
+    length: int,
+    history_length: jax.Array | int,
+    burn_in_gradient: bool,
+) -> tuple[Segment, jax.Array]:
+    """Steps ``first`` to ``first + m - 1`` with the burn-in before them, and their slots [m, M].
+
+    Args:
+        ring: the steps.
+        ages: int32 [C], steps of the same episode before each.
+        first: int32 [M], such that the last of the m steps is below ``count``.
+        count: int32 [], steps ever written; the ring holds the last C of them.
+        tokens: L, tokens of the burn-in.
+        length: m.
+        history_length: l <= L, tokens of the burn-in that may be read.
+        burn_in_gradient: see `Segment`.
+    """
+    capacity = ages.shape[0]
+    offset = jnp.arange(-tokens, length, dtype=jnp.int32)
+    number = first[None, :] + offset[:, None]
+    slots = number % capacity
+    oldest = jnp.maximum(count - capacity, 0)
+    starts = (ages[slots] == 0) | (number == oldest) | (offset == -history_length)[:, None]
+    steps = jax.tree.map(lambda kept: kept[slots], ring)
+    segment = Segment(
+        steps=steps,
+        starts=starts,
+        observation=flat(steps.observation[tokens:]),
+        previous_action=flat(steps.previous_action[tokens:]),
+        following=False,
+        burn_in_gradient=burn_in_gradient,
+    )
+    return segment, slots[tokens:]
 
 
 def next_window(

@@ -13,7 +13,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from rtd3jax.agents.history import Steps, Window
+from rtd3jax.agents.history import History, Segment, Steps, Window, flat
 from rtd3jax.agents.memory.base import Carry, Memory, Params, check_memory
 from rtd3jax.agents.products import matmul
 from rtd3jax.errors import UserError, first_line
@@ -124,6 +124,32 @@ class Network(nn.Module):
         encoded = self.encode(past_tokens(self.reads.memory, window.past))
         return self.memory.end(None, encoded, window.exists)
 
+    def carries(self, carry: Carry | None, tokens: jax.Array, starts: jax.Array) -> Carry:
+        """The memory's carries [T, B, ...] after each of ``tokens`` [T, B, parts].
+
+        ``carry`` is before the first of them, None for zeros; before those that ``starts`` marks it
+        is zero.
+        """
+        assert self.memory is not None
+        return self.memory.carries(carry, self.encode(tokens), starts)
+
+    def advance(self, window: Window, action: jax.Array, carry: Carry) -> Carry:
+        """The carry after the present step has become a past one, with the ``action`` [B, A]."""
+        assert self.memory is not None
+        token = current_token(self.reads.memory, window, action)
+        return self.memory.step(carry, self.encode(token[None])[0])
+
+    def from_carries(
+        self, window: Window, action: jax.Array | None, before: Carry, after: Carry
+    ) -> jax.Array:
+        """The output [B, outputs] from the carries before and after the present step."""
+        assert self.memory is not None
+        feature = self.memory.read(after if self.reads.memory_has_current else before)
+        current = None
+        if self.reads.current:
+            current = current_token(self.reads.current, window, action)
+        return self.from_features(feature, current)
+
     def zero_carry(self, batch: int) -> Carry:
         """The memory's carry before any token; None without a memory."""
         return None if self.memory is None else self.memory.zero(batch)
@@ -207,27 +233,100 @@ def init_network(key: jax.Array, network: Network) -> Params:
 def apply_network(
     network: Network,
     params: Params,
-    window: Window,
+    history: History,
     action: jax.Array | None = None,
     carry: Carry | None = None,
 ) -> jax.Array:
-    """The network's output [B, outputs] with ``params``; see `Network`."""
-    chex.assert_rank((window.observation, window.previous_action, window.past.action), (2, 2, 3))
+    """The network's output [B, outputs] with ``params``.
+
+    Args:
+        network: an actor or a critic.
+        params: its parameters.
+        history: a window or a segment; see `rtd3jax.agents.history`.
+        action: [B, A], the current action, which critics read. None with a segment: what was done.
+        carry: the carry before the current token, where it is known; the past is not read then.
+    """
+    chex.assert_rank((history.observation, history.previous_action), 2)
     if action is not None:
-        chex.assert_equal_shape((action, window.previous_action))
-    output = network.apply({"params": params}, window, action, carry)
+        chex.assert_equal_shape((action, history.previous_action))
+    if isinstance(history, Segment):
+        return _apply_to_segment(network, params, history, action, carry)
+    chex.assert_rank(history.past.action, 3)
+    return _output(network, params, history, action, carry)
+
+
+def act(actor: Network, params: Params, history: History, carry: Carry | None = None) -> jax.Array:
+    """The deterministic action [B, A] of an actor, in half ranges: tanh of the output."""
+    return jnp.tanh(apply_network(actor, params, history, carry=carry))
+
+
+def carry_before(network: Network, params: Params, history: History) -> Carry:
+    """The carry after the past tokens of ``history``, before the current one."""
+    if isinstance(history, Segment):
+        before, after = segment_carries(network, params, history)
+        return after if history.following else before
+    return network.apply({"params": params}, history, method="carry_before")
+
+
+def advance(
+    network: Network, params: Params, window: Window, action: jax.Array, carry: Carry
+) -> Carry:
+    """The carry after the present step of ``window``, at which ``action`` [B, A] was done."""
+    return network.apply({"params": params}, window, action, carry, method="advance")
+
+
+def segment_carries(network: Network, params: Params, segment: Segment) -> tuple[Carry, Carry]:
+    """The carries, leaves [B, ...], before and after the token of each of the segment's steps."""
+    tokens = past_tokens(network.reads.memory, segment.steps)
+    burn_in = tokens.shape[0] - segment.length
+
+    def carries(params: Params, carry: Carry | None, part: slice) -> Carry:
+        inputs = carry, tokens[part], segment.starts[part]
+        return network.apply({"params": params}, *inputs, method="carries")
+
+    own = slice(burn_in, None)
+    if segment.burn_in_gradient:
+        through = carries(params, None, slice(None))
+        last = jax.tree.map(lambda leaf: leaf[burn_in - 1], through)
+        after = jax.tree.map(lambda leaf: leaf[own], through)
+    else:
+        through = carries(jax.lax.stop_gradient(params), None, slice(burn_in))
+        last = jax.tree.map(lambda leaf: leaf[-1], through)
+        after = carries(params, last, own)
+
+    def before(last: jax.Array, after: jax.Array) -> jax.Array:
+        earlier = jnp.concatenate((last[None], after[:-1]))
+        starts = segment.starts[own].reshape(*earlier.shape[:2], *[1] * (earlier.ndim - 2))
+        return jnp.where(starts, 0.0, earlier)
+
+    return jax.tree.map(flat, jax.tree.map(before, last, after)), jax.tree.map(flat, after)
+
+
+def _apply_to_segment(
+    network: Network,
+    params: Params,
+    segment: Segment,
+    action: jax.Array | None,
+    carry: Carry | None,
+) -> jax.Array:
+    """`apply_network`: one pass over the tokens, then one step of the memory for all B at once."""
+    recorded = action is None and not segment.following
+    if recorded:
+        action = segment.action
+    if network.reads.memory and carry is None:
+        if recorded:  # the current token is one of the segment's own, already passed
+            carries = segment_carries(network, params, segment)
+            return _output(
+                network, params, segment.present, action, *carries, method="from_carries"
+            )
+        carry = carry_before(network, params, segment)
+    return _output(network, params, segment.present, action, carry)
+
+
+def _output(network: Network, params: Params, *inputs: Any, method: str | None = None) -> jax.Array:
+    output = network.apply({"params": params}, *inputs, method=method)
     assert isinstance(output, jax.Array)  # and no mutable collections beside it
     return output
-
-
-def act(actor: Network, params: Params, window: Window, carry: Carry | None = None) -> jax.Array:
-    """The deterministic action [B, A] of an actor, in half ranges: tanh of the output."""
-    return jnp.tanh(apply_network(actor, params, window, carry=carry))
-
-
-def carry_before(network: Network, params: Params, window: Window) -> Carry:
-    """The carry after the window's past tokens, before the current one."""
-    return network.apply({"params": params}, window, method="carry_before")
 
 
 def part_sizes(observation_size: int, action_size: int) -> dict[str, int]:

@@ -14,12 +14,16 @@ import jax.numpy as jnp
 from flax import struct
 
 from rtd3jax.agents.history import (
+    History,
+    Segment,
     Steps,
     Window,
     empty_steps,
+    flat,
     next_window,
     put_row,
     put_step,
+    segment_at,
     window_at,
 )
 from rtd3jax.agents.memory.base import Carry
@@ -63,15 +67,24 @@ class Replay:
 
 @struct.dataclass
 class Batch:
-    """Sampled transitions, leaves [B, ...]; ``carry`` and ``next_carry`` for h-td3 only."""
+    """Sampled transitions, leaves [B, ...]; ``carry`` and ``next_carry`` for h-td3 only.
 
-    window: Window
+    ``window`` and ``next_window`` are windows, or segments whose tokens serve several transitions;
+    `rtd3jax.agents.networks.apply_network` takes both.
+    """
+
+    window: History
     action: jax.Array
     reward: jax.Array
     terminated: jax.Array
-    next_window: Window
+    next_window: History
     carry: Carry | None
     next_carry: Carry | None
+
+    @property
+    def recorded_action(self) -> jax.Array | None:
+        """``action`` for `apply_network`: None where a segment's own tokens hold it."""
+        return None if isinstance(self.window, Segment) and self.carry is None else self.action
 
 
 def empty_replay(
@@ -259,16 +272,7 @@ def gather(
         kept.step.previous_action[slot],
     )
     action = kept.step.action[slot]
-    carry = next_carry = None
-    if replay.carries is not None:
-        carry = _carry_at(replay.carries, number)
-        carry = jax.tree.map(
-            lambda part: jnp.where(
-                (age == 0).reshape(-1, *[1] * (part.ndim - 1)), jnp.zeros_like(part), part
-            ),
-            carry,
-        )
-        next_carry = _carry_at(replay.carries, number + 1)
+    carry, next_carry = _stored_carries(replay, number, age)
     return Batch(
         window=window,
         action=action,
@@ -278,6 +282,85 @@ def gather(
         carry=carry,
         next_carry=next_carry,
     )
+
+
+def sample_segments(
+    replay: Replay,
+    key: jax.Array,
+    count: jax.Array,
+    batch_size: int,
+    tokens: int,
+    history_length: jax.Array | int,
+    length: int,
+    burn_in_gradient: bool,
+) -> Batch:
+    """As `sample`, but B / m stretches of m consecutive steps, their first steps uniform.
+
+    Args:
+        replay: the ring.
+        key: consumed here.
+        count: int32 [], steps written so far, at least m.
+        batch_size: B, a multiple of m.
+        tokens: L, steps of the burn-in.
+        history_length: l <= L, steps of the burn-in that may be read.
+        length: m.
+        burn_in_gradient: whether a gradient flows back into the burn-in.
+    """
+    oldest = jnp.maximum(count - replay.transitions.reward.shape[0], 0)
+    first = jax.random.randint(key, (batch_size // length,), oldest, count - length + 1, jnp.int32)
+    return gather_segments(replay, first, count, tokens, history_length, length, burn_in_gradient)
+
+
+def gather_segments(
+    replay: Replay,
+    first: jax.Array,
+    count: jax.Array,
+    tokens: int,
+    history_length: jax.Array | int,
+    length: int,
+    burn_in_gradient: bool,
+) -> Batch:
+    """The batch of the stretches that begin at these numbers (int32 [M]); see `sample_segments`.
+
+    Transitions lie in the order of `Segment`: number by number, the M places side by side.
+    """
+    kept = replay.transitions
+    segment, slots = segment_at(
+        kept.step, kept.age, first, count, tokens, length, history_length, burn_in_gradient
+    )
+    slot, action = slots.reshape(-1), segment.action
+    number = flat(first[None, :] + jnp.arange(length, dtype=jnp.int32)[:, None])
+    carry, next_carry = _stored_carries(replay, number, kept.age[slot])
+    following = dataclasses.replace(
+        segment,
+        observation=kept.next_observation[slot],
+        previous_action=action,
+        following=True,
+    )
+    return Batch(
+        window=segment,
+        action=action,
+        reward=kept.reward[slot],
+        terminated=kept.terminated[slot],
+        next_window=following,
+        carry=carry,
+        next_carry=next_carry,
+    )
+
+
+def _stored_carries(
+    replay: Replay, number: jax.Array, age: jax.Array
+) -> tuple[Carry | None, Carry | None]:
+    """The behaviour actor's carries before steps ``number`` (int32 [B]) and after them."""
+    if replay.carries is None:
+        return None, None
+    carry = jax.tree.map(
+        lambda part: jnp.where(
+            (age == 0).reshape(-1, *[1] * (part.ndim - 1)), jnp.zeros_like(part), part
+        ),
+        _carry_at(replay.carries, number),
+    )
+    return carry, _carry_at(replay.carries, number + 1)
 
 
 def _carry_at(carries: Carry, number: jax.Array) -> Carry:

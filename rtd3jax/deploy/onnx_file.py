@@ -98,12 +98,17 @@ def _build(graph: _Graph, model: Model) -> None:
     length = model.history_length
     carry: list[str] = []
     if model.memory:
-        pads = graph.integers(0, 1, 0, 0, 0, 0)  # a zero row in front: the carry that begins now
-        carry = [graph.add("Pad", [part, pads]) for part in _CARRIES[model.cell]]
+        carry = [*_CARRIES[model.cell]]
+        if not model.runs_on:
+            pads = graph.integers(0, 1, 0, 0, 0, 0)  # a zero row: the carry that begins now
+            carry = [graph.add("Pad", [part, pads]) for part in carry]
         if model.memory_has_current:
             carry = _feed(graph, model, carry)
-        features.append(_row(graph, carry[0], length))
-        carry = [_rows(graph, part, length) for part in carry]
+        if model.runs_on:
+            features.append(graph.add("Squeeze", [carry[0], graph.integers(1)]))
+        else:
+            features.append(_row(graph, carry[0], length))
+            carry = [_rows(graph, part, length) for part in carry]
     if model.current:
         features.append(graph.add("Relu", [graph.linear("current", graph.join(model.current))]))
     head = graph.add("Relu", [graph.linear("head", graph.join(features))])

@@ -6,7 +6,8 @@
 
 `ABOUT` says what the policy is. The window that the agent reads is kept as carries of its
 memory side by side, each begun at another of the last steps; one product advances them all, and the
-last row is the one that has read the whole window. Carries of zeros are the start of an episode.
+last row is the one that has read the whole window. A policy whose carry runs on from the episode's
+start has that one alone. Carries of zeros are the start of an episode.
 """
 
 import base64
@@ -38,7 +39,8 @@ class Player:
         }
         self._centre, self._half_range = arrays["action_centre"], arrays["action_half_range"]
         self._centre_token = arrays.get("centre_token")
-        self._length: int = about["history_length"]
+        self._length: int = about["rows"]
+        self._runs_on: bool = about["acting"] == "carry"
         self._with_current: bool = about["memory_has_current"]
         if about["memory"]:
             width = arrays["head_bias"].size
@@ -52,10 +54,12 @@ class Player:
             if "recurrent_kernel" in arrays:
                 self._recurrent = arrays["recurrent_kernel"] * half
                 self._recurrent_bias = arrays.get("recurrent_bias", np.float32(0.0)) * half
-            self._rows = self._length + self._with_current
+            # Row 0 is zero for ever, the carry that begins with a token, unless one runs on.
+            self._first = 0 if self._runs_on else 1
+            self._rows = 1 if self._runs_on else self._length + self._with_current
             self._gates = np.empty((self._rows, half.size), np.float32)
-            self._hidden = np.zeros((self._length + 1, width), np.float32)
-            self._cell = np.zeros((self._length + 1, width), np.float32)
+            self._hidden = np.zeros((self._length + self._first, width), np.float32)
+            self._cell = np.zeros((self._length + self._first, width), np.float32)
         self.reset()
 
     def reset(self) -> None:
@@ -101,9 +105,8 @@ class Player:
         """Give all carries the step's token; the hidden state of the one that began first."""
         kernel, bias = self._input
         token = self._relu("encoder", _join(parts, self.about["memory"])) @ kernel + bias
-        # Row 0 is zero for ever: the carry that begins with this token.
         hidden = self._advance(token, self._hidden[: self._rows])
-        self._hidden[1:] = hidden[: self._length]
+        self._hidden[self._first :] = hidden[: self._length]
         return hidden[-1]
 
     def _lstm(self, token: np.ndarray, hidden: np.ndarray) -> np.ndarray:
@@ -116,7 +119,7 @@ class Player:
         sigmoids += 0.5
         i, f, o, g = (gates[:, k * width : (k + 1) * width] for k in range(4))
         cell = f * self._cell[: self._rows] + i * g
-        self._cell[1:] = cell[: self._length]
+        self._cell[self._first :] = cell[: self._length]
         return o * np.tanh(cell)
 
     def _gru(self, token: np.ndarray, hidden: np.ndarray) -> np.ndarray:

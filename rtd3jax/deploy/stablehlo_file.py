@@ -89,12 +89,12 @@ def play(
     feature = None
     if model.memory:
         structure = jax.tree.structure(jax.eval_shape(lambda: network.zero_carry(1)))
-        carry = [_with_zero_row(state[name]) for name in names]
+        carry = [state[n] if model.runs_on else _with_zero_row(state[n]) for n in names]
         if model.memory_has_current:
             carry = feed(carry)
         last = jax.tree.unflatten(structure, [part[:, -1] for part in carry])
         feature = network.apply(variables, last, method=lambda m, c: m.memory.read(c))
-        carry = [part[:, :-1] for part in carry]
+        carry = [part[:, : model.rows] for part in carry]
     current = None
     if model.current:
         current = jnp.concatenate([parts[part] for part in model.current], axis=-1)

@@ -101,14 +101,20 @@ def parser(description: str | None) -> argparse.ArgumentParser:
     for field in dataclasses.fields(Config):
         if field.name not in _GRID_FIELDS:
             default = "" if field.default is None else f" [{field.default}]"
-            kind = {"str": str, "float": float}.get(str(getattr(field.type, "__name__", "")), int)
-            config.add_argument(
-                "--" + field.name.replace("_", "-"),
-                type=kind,
-                metavar="NAME" if kind is str else "N",
-                help=field.metadata["help"].replace("%", "%%") + default,
-            )
+            flag, help = "--" + field.name.replace("_", "-"), field.metadata["help"] + default
+            help = help.replace("%", "%%")
+            if field.type is bool:
+                switch = argparse.BooleanOptionalAction
+                config.add_argument(flag, action=switch, default=None, help=help)
+                continue
+            kind = next((k for k in (str, float) if k.__name__ in _type_name(field)), int)
+            metavar = "NAME" if kind is str else "N"
+            config.add_argument(flag, type=kind, metavar=metavar, help=help)
     return found
+
+
+def _type_name(field: dataclasses.Field) -> str:
+    return getattr(field.type, "__name__", str(field.type))
 
 
 def grids(options: argparse.Namespace) -> list[Grid]:

@@ -230,6 +230,7 @@ class RunDirectory:
             history_length=cell.config.tokens,
             width=cell.config.hidden_size,
             memory=cell.config.memory,
+            acting="carry" if cell.config.runs_on else "window",
             format=about.get("format", 1),
         )
 

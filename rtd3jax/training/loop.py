@@ -16,9 +16,9 @@ from jax import lax
 
 from rtd3jax.agents.agent import Agent, make_agent
 from rtd3jax.agents.bounds import Bounds
-from rtd3jax.agents.history import Steps
+from rtd3jax.agents.history import Steps, Window
 from rtd3jax.agents.hyperparameters import Hyperparameters
-from rtd3jax.agents.memory.base import Params
+from rtd3jax.agents.memory.base import Carry, Params
 from rtd3jax.agents.noise import add_noise
 from rtd3jax.agents.replay import (
     Replay,
@@ -72,6 +72,7 @@ class LaneState:
         observation: [O], the one to act upon.
         previous_action: [A], in half ranges as all actions of an agent; zero at an episode's start.
         age: int32 [], steps done in the episode.
+        carry: the actor's, leaves [1, ...], where it runs on from the episode's start; else None.
         returns: [K], mean return of each evaluation so far.
         true_returns: [K], the same of the undisturbed state's reward.
         metrics: of learning, averaged over each interval between evaluations.
@@ -85,6 +86,7 @@ class LaneState:
     observation: jax.Array
     previous_action: jax.Array
     age: jax.Array
+    carry: Carry | None
     returns: jax.Array
     true_returns: jax.Array
     metrics: Averages
@@ -147,6 +149,7 @@ class Program:
             observation=observation.astype(jnp.float32),
             previous_action=jnp.zeros((self.action_size,), jnp.float32),
             age=jnp.int32(0),
+            carry=self.agent.zero_carry(),
             returns=jnp.full((self.evaluations,), jnp.nan, jnp.float32),
             true_returns=jnp.full((self.evaluations,), jnp.nan, jnp.float32),
             metrics=empty_averages(self.agent.metrics, self.evaluations),
@@ -167,6 +170,7 @@ class Program:
             centre_token=jnp.zeros((self.action_size,), jnp.float32),
             algorithm=self.config.algorithm,
             memory=self.config.memory,
+            acting="carry" if self.config.runs_on else "window",
             tokens=self.tokens,
             observation_size=self.observation_size,
             action_shape=self.action_shape,
@@ -189,12 +193,13 @@ class Program:
             state.age,
             state.observation,
             state.previous_action,
-            self.tokens,
+            self.agent.acting_tokens,
             numbers.history_length,
         )
-        greedy, carry = self.agent.act(state.learner.actor, window)
+        greedy, kept = self.agent.act(state.learner.actor, window, state.carry)
         action = self._explore(greedy, act_key, numbers, step)
-        replay = keep_acting_carry(state.replay, step, state.age, carry)
+        carry = self.agent.carry_after(state.learner.actor, window, action[None], state.carry)
+        replay = keep_acting_carry(state.replay, step, state.age, kept)
 
         learner, metrics, loss = self._learn(
             state.learner, replay, state.metrics, learn_key, numbers, step
@@ -220,12 +225,8 @@ class Program:
                 age=state.age,
             ),
             done,
-            final_carry=lambda: self.agent.final_carry(
-                learner.actor,
-                window,
-                action[None],
-                final_observation[None],
-                numbers.history_length,
+            final_carry=lambda: self._final_carry(
+                learner.actor, window, action, final_observation, numbers, carry
             ),
             # Losses are not negative, and actions not above one.
             never=(loss < 0.0) & jnp.all(action > 1.0),
@@ -239,11 +240,28 @@ class Program:
             observation=observation.astype(jnp.float32),
             previous_action=jnp.where(done, 0.0, action),
             age=jnp.where(done, 0, state.age + 1).astype(jnp.int32),
+            carry=jax.tree.map(lambda part: jnp.where(done, 0.0, part), carry),
             metrics=note_reward(metrics, reward, done),
         )
         state = _note_failure(state, step, ~finite, ENVIRONMENT_NOT_FINITE)
         state = _note_failure(state, step, ~jnp.isfinite(loss), LOSS_NOT_FINITE)
         return self._evaluate(lane, state, step + 1)
+
+    def _final_carry(
+        self,
+        actor: Params,
+        window: Window,
+        action: jax.Array,
+        final_observation: jax.Array,
+        numbers: Hyperparameters,
+        running: Carry | None,
+    ) -> Carry:
+        """The actor's carry before an episode's final observation [O], after ``action`` [A]."""
+        if running is not None:
+            return running
+        return self.agent.final_carry(
+            actor, window, action[None], final_observation[None], numbers.history_length
+        )
 
     def _explore(
         self, greedy: jax.Array, key: jax.Array, numbers: Hyperparameters, step: jax.Array

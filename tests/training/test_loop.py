@@ -49,13 +49,19 @@ class Clock(environment.Environment):
         return spaces.Box(-1.0, 1.0, (1,))
 
 
-@pytest.fixture(scope="module")
-def lane():
-    """h-td3 that never learns, so that every stored carry can be computed again."""
+@pytest.fixture(scope="module", params=["window", "carry"])
+def lane(request):
+    """h-td3 that never learns, so that every stored carry can be computed again.
+
+    With a carry that runs on, its history is as long as the longest episode.
+    """
     env = Clock()
+    replay = "windows" if request.param == "window" else "segments"
     config = Config(
         algorithm="h-td3",
-        history_length=3,
+        history_length=3 if request.param == "window" else 7,
+        replay=replay,
+        acting=request.param,
         total_steps=STEPS,
         hidden_size=4,
         batch_size=4,
@@ -103,7 +109,8 @@ def test_stored_carries_are_the_actors_own(lane):
     program, _, state = lane
     # The newest row's next carry is known only once the agent has acted again.
     numbers = jnp.arange(STEPS - 1, dtype=jnp.int32)
-    batch = gather(state.replay, numbers, jnp.int32(STEPS), 3, 3)
+    length = program.tokens
+    batch = gather(state.replay, numbers, jnp.int32(STEPS), length, length)
     actor, network = state.learner.actor, program.agent.acting
     for stored, window in ((batch.carry, batch.window), (batch.next_carry, batch.next_window)):
         for got, want in zip(stored, carry_before(network, actor, window), strict=True):

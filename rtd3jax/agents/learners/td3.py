@@ -13,7 +13,7 @@ import optax
 from flax import struct
 from jax import lax
 
-from rtd3jax.agents.history import Window
+from rtd3jax.agents.history import History
 from rtd3jax.agents.hyperparameters import Hyperparameters
 from rtd3jax.agents.learners.base import Measured, Metrics, Networks, measured, not_measured
 from rtd3jax.agents.memory.base import Params
@@ -146,7 +146,7 @@ def critic_loss(
 
     The loss is the sum over the two critics.
     """
-    value = _value(critic, params, batch.window, batch.action, batch.carry)
+    value = _value(critic, params, batch.window, batch.recorded_action, batch.carry)
     error = value - y
     return jnp.mean(error**2), jnp.mean(value)
 
@@ -246,8 +246,8 @@ def update_actor_and_targets(
     return state, dict(zip(ACTOR_METRICS, found, strict=True))
 
 
-def _value(critic: Network, params: Params, window: Window, action, carry) -> jax.Array:
-    return apply_network(critic, params, window, action, carry)[:, 0]
+def _value(critic: Network, params: Params, history: History, action, carry) -> jax.Array:
+    return apply_network(critic, params, history, action, carry)[:, 0]
 
 
 def _norm(wanted: jax.Array, gradient: Params) -> Measured:
