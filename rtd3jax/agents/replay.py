@@ -194,7 +194,8 @@ def store(
             observation; called where the ring keeps carries.
         never: bool [], false, computed from what the updates read; see `_after`.
     """
-    replay = put_transition(replay, _after(step, never), row)
+    step = _after(step, never)
+    replay = put_transition(replay, step, row)
     if replay.carries is None:
         return replay
     # Within an episode the next step's own carry takes this slot.

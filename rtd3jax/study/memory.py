@@ -18,6 +18,9 @@ _GRADIENTS = 1.3
 _ACTING = 8
 """Arrays of [l + 1, E, H] that are alive while E episodes are evaluated side by side."""
 
+_PRESENT_STEPS = 22
+"""Arrays of [B, H] that are alive beside a segment's: one step of the memory for each transition."""
+
 _HEADROOM = 0.8
 """Share of the memory that lanes may take: programs, tables and the rest need some too."""
 
@@ -34,16 +37,21 @@ def state_bytes(job: Job) -> int:
 
 def working_bytes(config: Config, observation_size: int, action_size: int) -> int:
     """Bytes that a lane needs beside its state while it advances: activations and gradients."""
-    tokens = config.tokens + 1
-    array = 4 * tokens * config.hidden_size
+    row = 4 * config.hidden_size
+    array = (config.tokens + 1) * row
     counts = count_parameters(
         config.algorithm, observation_size, action_size, config.hidden_size, config.memory
     )
     gradients = 4 * (counts["actor"] + 2 * counts["critic"])
-    update = (
-        AGENTS[config.algorithm].peak_arrays * array * config.batch_size + _GRADIENTS * gradients
-    )
-    return int(max(update, _ACTING * array * config.eval_episodes))
+    activations = AGENTS[config.algorithm].peak_arrays * array * config.batch_size
+    if config.replay == "segments":
+        length = config.segment_steps
+        tokens = (config.tokens + length) * (config.batch_size // length)
+        activations = AGENTS[config.algorithm].peak_arrays * tokens * row
+        activations += _PRESENT_STEPS * config.batch_size * row
+    acting = row if config.runs_on else array
+    update = activations + _GRADIENTS * gradients
+    return int(max(update, _ACTING * acting * config.eval_episodes))
 
 
 def job_bytes(jobs: Sequence[Job]) -> dict[Any, tuple[int, int]]:

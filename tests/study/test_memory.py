@@ -16,11 +16,17 @@ def _jobs(seeds=1, **changes):
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "length"),
-    [("lstm-td3-1ha1hc", 8), ("h-td3", 8)],
+    ("algorithm", "length", "replay"),
+    [
+        ("lstm-td3-1ha1hc", 8, "windows"),
+        ("h-td3", 8, "windows"),
+        ("lstm-td3-1ha2hc", 20, "segments"),
+        ("h-td3", 20, "segments"),
+    ],
 )
-def test_the_plan_is_within_15_percent_of_what_xla_reserves(algorithm, length):
-    (job,) = _jobs(algorithm=algorithm, history_length=length, total_steps=10_000)
+def test_the_plan_is_within_15_percent_of_what_xla_reserves(algorithm, length, replay):
+    changes = dict(algorithm=algorithm, history_length=length, replay=replay)
+    (job,) = _jobs(**changes, total_steps=10_000)
     state = jax.eval_shape(job.program.init, job.lane)
     step = jax.ShapeDtypeStruct((), jnp.int32)
     advance = jax.jit(job.program.advance, donate_argnums=1)
