@@ -19,7 +19,7 @@ _ACTING = 8
 """Arrays of [l + 1, E, H] that are alive while E episodes are evaluated side by side."""
 
 _PRESENT_STEPS = 22
-"""Arrays of [B, H] that are alive beside a segment's: one step of the memory for each transition."""
+"""Arrays of [B, H] alive beside a segment's: one step of the memory for each transition."""
 
 _HEADROOM = 0.8
 """Share of the memory that lanes may take: programs, tables and the rest need some too."""

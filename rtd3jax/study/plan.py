@@ -167,24 +167,43 @@ def update_flops(config: Config) -> float:
     def head(network: Network) -> float:
         return layer * (1 + bool(network.reads.memory and network.reads.current))
 
+    segments = config.replay == "segments"
+
+    def present(network: Network) -> float:
+        """The current token alone, and what follows the memory."""
+        return network.reads.memory_has_current * sum(token(network)) + head(network)
+
     def forward(network: Network) -> float:
-        of_input, of_carry = token(network)
-        reads = network.reads
-        tokens = int(reads.memory_has_current)
-        if reads.memory and not reads.carry_from_replay:
-            tokens += config.tokens
-            # The first token has no carry.
-            return tokens * (of_input + of_carry) - of_carry + head(network)
-        return tokens * (of_input + of_carry) + head(network)
+        """At a history and a current token that is not among it."""
+        if not network.reads.memory or network.reads.carry_from_replay:
+            return present(network)
+        if segments:
+            return passed(network, config.tokens) + present(network)
+        # The first token has no carry.
+        return config.tokens * sum(token(network)) - token(network)[1] + present(network)
+
+    def passed(network: Network, burn_in: int) -> float:
+        """One pass over the tokens of all segments."""
+        length = config.segment_steps
+        return (burn_in + length) / length * sum(token(network))
+
+    def recorded(network: Network) -> float:
+        """At what was done: a segment's own tokens."""
+        if segments and network.reads.memory and not network.reads.carry_from_replay:
+            return passed(network, config.tokens) + head(network)
+        return forward(network)
 
     def backward(network: Network) -> float:
+        if segments and network.reads.memory and not network.reads.carry_from_replay:
+            burn_in = config.tokens if config.burn_in_gradient else 0
+            return 2 * (passed(network, burn_in) + head(network))
         return 2 * forward(network) - token(network)[1] * network.reads.carry_from_replay
 
     to_action = head(critic)
     if critic.reads.memory_has_current and "action" in critic.reads.memory:
         to_action += token(critic)[0]
-    critics = forward(actor) + 2 * forward(critic) + 2 * (forward(critic) + backward(critic))
-    delayed = forward(actor) + backward(actor) + forward(critic) + to_action
+    critics = forward(actor) + 2 * forward(critic) + 2 * (recorded(critic) + backward(critic))
+    delayed = recorded(actor) + backward(actor) + forward(critic) + to_action
     return (critics + delayed / config.policy_delay) / config.update_every
 
 

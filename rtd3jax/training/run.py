@@ -32,7 +32,7 @@ from rtd3jax.training.loop import (
     make_program,
 )
 from rtd3jax.training.progress import Progress
-from rtd3jax.training.worth import warn_if_untrained
+from rtd3jax.training.worth import check_segments, warn_if_untrained
 
 _REASONS = {
     ENVIRONMENT_NOT_FINITE: "the environment gave an observation or reward that is not finite; "
@@ -212,6 +212,13 @@ def _ended(groups: Iterable[Group]) -> dict[tuple[Any, int], tuple[Job, LaneStat
     return found
 
 
+def _horizon(params: Any) -> int | None:
+    """The most steps of an episode, where the environment's parameters say it as gymnax's do."""
+    own = getattr(params, "env", params)
+    steps = getattr(own, "max_steps_in_episode", None)
+    return int(steps) if isinstance(steps, int) else None
+
+
 def make_jobs(
     env: Any,
     config: Config,
@@ -227,6 +234,7 @@ def make_jobs(
     """
     params = parameters_of(env, params)
     warn_if_untrained(config)
+    check_segments(config, _horizon(params))
     interface = describe(env, params)
     program = make_program(env, config, interface.observation_size, interface.action_shape, window)
     return [Job(program, make_lane(config, seed, params), (cell, seed)) for seed in seeds]

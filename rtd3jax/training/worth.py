@@ -3,6 +3,7 @@
 import warnings
 
 from rtd3jax.config import Config
+from rtd3jax.errors import UserError
 
 _ZERO = {
     "actor_learning_rate": "the actor will stay as it began",
@@ -39,6 +40,20 @@ def why_untrained(config: Config) -> str | None:
         if getattr(config, name) == 0:
             return f"{name} is 0, so that {what}: raise it"
     return None
+
+
+def check_segments(config: Config, horizon: int | None) -> None:
+    """Raise UserError where a segment is longer than an episode ever gets.
+
+    Args:
+        config: the agent's.
+        horizon: an episode's longest, in steps; None where it is not known.
+    """
+    if config.replay == "segments" and horizon is not None and config.segment_steps > horizon:
+        raise UserError(
+            f"segment_length ({config.segment_steps}) is longer than an episode ever gets "
+            f"({horizon} steps): lower it"
+        )
 
 
 def warn_if_untrained(config: Config) -> None:

@@ -1,0 +1,106 @@
+"""Segments against windows: whole training steps of one agent, taken in turns.
+
+Usage: python -m experiments.benchmarks.segments [--quick] [--agent A] [--lengths L ...]
+                                                 [--segment-lengths M ...] [--repeats N]
+                                                 [--seconds S] [--batch-size B] [--out DIR]
+
+One lane per core trains on the rover under AR(1) slip: environment step, replay and both updates.
+Every ratio is of neighbours in time; the table has the median. Writes segments.md, .parquet and
+.json under --out.
+"""
+
+import argparse
+import pathlib
+import sys
+import time
+
+import numpy as np
+import pandas as pd
+
+import rtd3jax as rtd
+from experiments.benchmarks.bench import RESULTS, machine
+from experiments.benchmarks.ours import Lanes, make_config
+from rtd3jax.training.lanes import workers
+
+sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
+from writing import markdown_table, provenance, write_results  # noqa: E402
+
+
+def ways(segment_lengths: list[int], batch_size: int) -> dict[str, dict[str, object]]:
+    """Fields of the configuration by name; windows first."""
+    found: dict[str, dict[str, object]] = {"windows": {}}
+    for m in segment_lengths:
+        segments = {"replay": "segments", "segment_length": m}
+        found[f"{batch_size // m} x {m}"] = segments
+        found[f"{batch_size // m} x {m}, cut"] = {**segments, "burn_in_gradient": False}
+    return found
+
+
+def measure(options: argparse.Namespace) -> pd.DataFrame:
+    """Milliseconds of a core for a step: columns history_length, way, repeat, milliseconds."""
+    rows = []
+    for length in options.lengths:
+        sides = {}
+        for name, fields in ways(options.segment_lengths, options.batch_size).items():
+            size = {"hidden_size": options.width, "batch_size": options.batch_size}
+            config = make_config(options.agent, length, **size, **fields)
+            sides[name] = Lanes(config, len(workers()))
+            sides[name].warm_up(options.seconds / 3)
+        for repeat in range(options.repeats):
+            for name, lanes in sides.items():
+                steps, seconds = lanes.run(options.seconds)
+                milliseconds = 1e3 * seconds * len(workers()) / steps
+                rows.append((length, name, repeat, milliseconds))
+        print(f"l={length}: measured", flush=True)
+    return pd.DataFrame(rows, columns=["history_length", "way", "repeat", "milliseconds"])
+
+
+def table(found: pd.DataFrame) -> str:
+    """Milliseconds and, in brackets, how many times faster than windows."""
+    names = list(dict.fromkeys(found["way"]))
+    body = []
+    for length, rows in found.groupby("history_length", sort=False):
+        taken = rows.pivot(index="repeat", columns="way", values="milliseconds")
+        line = [str(length)]
+        for name in names:
+            ratio = float(np.median(taken["windows"] / taken[name]))
+            line.append(f"{np.median(taken[name]):.2f} ({ratio:.2f})")
+        body.append(line)
+    return markdown_table(["l", *names], body)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="tiny and meaningless: does it run?")
+    parser.add_argument("--agent", choices=rtd.ALGORITHMS, default="lstm-td3-1ha1hc")
+    parser.add_argument("--lengths", nargs="+", type=int, default=[1, 6, 10, 20])
+    parser.add_argument("--segment-lengths", nargs="+", type=int, default=[5, 10, 20])
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--seconds", type=float, default=2.0)
+    parser.add_argument("--batch-size", type=int, default=100)
+    parser.add_argument("--width", type=int, default=128)
+    parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
+    options = parser.parse_args(arguments)
+    if options.quick:
+        options.lengths, options.segment_lengths, options.repeats = [1], [5], 1
+        options.seconds, options.batch_size, options.width = 0.05, 10, 8
+    began = time.time()
+    found = measure(options)
+    text = table(found)
+    facts = provenance(
+        agent=options.agent,
+        columns="segments x segment length; cut: without the burn-in's gradient",
+        cells="milliseconds of a core per step, and in brackets how many times as fast as windows",
+        width=options.width,
+        batch_size=options.batch_size,
+        repeats=options.repeats,
+        machine=machine(),
+        minutes=round((time.time() - began) / 60, 1),
+    )
+    write_results(options.out, "segments", found, text, facts)
+    print(text)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,274 @@
+"""Do returns pay for segments? Five paired seeds, windows against segments, the same steps.
+
+Usage: python experiments/segments_returns.py [--quick] [--search] [--tasks T ...] [--seeds N]
+                                              [--out DIR] [--report]
+
+`lstm-td3-1ha1hc`, width 64, with the evidence's settings: the rover under AR(1) slip at l = 6, the
+pendulum under `hidden`, `random-sine` and `noise` at l = 6 and 20. Policies are tested on 1,000
+episodes; those of segments act with a carry that runs on, and those of windows are tested with one
+too, which they have never seen. The pendulum's returns are normalised, the rover's are divided by
+the paper's best, |-1.36|. Then both ways take turns, to say what share of the windows' time a step
+with segments takes. Writes segments_returns.md, .parquet and .json.
+
+`--search` goes through candidates on seeds from 100 on, which are not reported, and writes
+segments_search.csv. A row that is there is not trained again.
+"""
+
+import argparse
+import pathlib
+import sys
+import time
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+import rtd3jax as rtd
+from rtd3jax.envs.registry import parse_disturbance
+from rtd3jax.study import presets
+
+HERE = pathlib.Path(__file__).parent
+sys.path[:0] = [str(HERE), str(HERE.parent)]
+from pendulum import scale  # noqa: E402
+from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
+
+from experiments.benchmarks.ours import Lanes, make_config  # noqa: E402
+from rtd3jax.training.lanes import workers  # noqa: E402
+
+AGENT, WIDTH, EPISODES = "lstm-td3-1ha1hc", 64, 1_000
+PAPERS_BEST = 1.36
+"""What the rover's returns are divided by: the paper's best agent has -1.36."""
+SEARCH_SEED, SEARCH_SEEDS, SEARCH_EPISODES = 100, 3, 400
+TASKS: dict[str, tuple[str, str, int]] = {
+    "rover ar1-slip l=6": ("rover", "ar1-slip", 6),
+    **{
+        f"pendulum {name} l={length}": ("pendulum", name, length)
+        for length in (6, 20)
+        for name in ("hidden", "random-sine", "noise")
+    },
+}
+ROVER = {**presets.ROVER_SETTINGS, "total_steps": 40_000, "batch_size": 100}
+PENDULUM = {**presets.PENDULUM_SETTINGS, "total_steps": presets.PENDULUM_STEPS}
+SEGMENTS: dict[str, Any] = {"replay": "segments"}
+CHOSEN: dict[tuple[str, int], dict[str, Any]] = {
+    ("rover", 6): {**SEGMENTS, "batch_size": 200, "segment_length": 4},
+    ("pendulum", 6): {**SEGMENTS, "batch_size": 50, "segment_length": 5},
+    ("pendulum", 20): {**SEGMENTS, "batch_size": 100, "segment_length": 10},
+}
+"""Of the candidates, by environment and history length."""
+CANDIDATES: dict[tuple[str, int], list[tuple[int, int, bool]]] = {
+    ("rover", 6): [(100, 5, True), (200, 4, True), (200, 10, True)],
+    ("pendulum", 6): [(50, 5, True), (80, 5, True), (100, 10, True), (80, 5, False)],
+    ("pendulum", 20): [(100, 10, True), (150, 10, True), (100, 5, False), (200, 10, False)],
+}
+"""Batch size, segment length and whether the burn-in has a gradient."""
+SEARCHED = ("rover ar1-slip l=6", "pendulum hidden l=6", "pendulum random-sine l=20")
+
+
+def settings(task: str) -> dict[str, Any]:
+    """The windows' setting of a task."""
+    env, _, length = TASKS[task]
+    base = ROVER if env == "rover" else PENDULUM
+    return {**base, "history_length": length, "hidden_size": WIDTH, "algorithm": AGENT}
+
+
+def returns(
+    task: str, fields: dict[str, Any], seeds: range, episodes: int, tiny: dict[str, Any]
+) -> dict[str, list[float]]:
+    """Normalised mean return of each seed's final policy, as it acts by itself and otherwise."""
+    env_id, disturbance, _ = TASKS[task]
+    name, parameters = parse_disturbance(disturbance)
+    env = rtd.make(env_id, name, **parameters)
+    run = rtd.train(env, rtd.Config(**{**settings(task), **fields, **tiny}), seeds, progress=False)
+    low, high = (0.0, PAPERS_BEST) if env_id == "rover" else scale(disturbance)
+    found = {}
+    for acting in ("window", "carry"):
+        policies = [run.policy(seed).replace(acting=acting) for seed in seeds]
+        means = [
+            float(np.mean(rtd.evaluate(policy, env, episodes, seed=9, true_reward=True)))
+            for policy in policies
+        ]
+        found[acting] = [(mean - low) / (high - low) for mean in means]
+    return found
+
+
+def cost(task: str, fields: dict[str, Any], seconds: float, repeats: int) -> float:
+    """A step's time with segments as a share of the windows', measured in turns; the median."""
+    sides = []
+    for changes in ({}, fields):
+        own = {**settings(task), **changes, "learning_starts": 1_000}
+        own = {name: value for name, value in own.items() if name not in _OF_THE_BENCH}
+        config = make_config(AGENT, TASKS[task][2], **own)
+        lanes = Lanes(config, len(workers()))
+        lanes.warm_up(seconds / 3)
+        sides.append(lanes)
+    shares = []
+    for _ in range(repeats):
+        taken = [duration / steps for steps, duration in (side.run(seconds) for side in sides)]
+        shares.append(taken[1] / taken[0])
+    return float(np.median(shares))
+
+
+_OF_THE_BENCH = ("algorithm", "history_length", "total_steps", "eval_every")
+
+
+def kept(path: pathlib.Path) -> pd.DataFrame:
+    """The rows that are there."""
+    if not path.exists():
+        return pd.DataFrame()
+    return pd.read_csv(path) if path.suffix == ".csv" else pd.read_parquet(path)
+
+
+def has(rows: pd.DataFrame, **values: Any) -> bool:
+    """Whether there is a row of these values."""
+    if rows.empty:
+        return False
+    there = np.ones(len(rows), bool)
+    for name, value in values.items():
+        there &= (rows[name] == value).to_numpy()
+    return bool(there.any())
+
+
+def search(path: pathlib.Path, tasks: list[str], tiny: dict[str, Any]) -> None:
+    """Fill in the table of candidates."""
+    rows = kept(path)
+    for task in tasks:
+        if task not in SEARCHED:
+            continue
+        env, _, length = TASKS[task]
+        base = settings(task)
+        ways = [(base["batch_size"], 0, True), *CANDIDATES[env, length]]
+        for batch_size, segment_length, gradient in ways:
+            key = dict(
+                task=task,
+                batch_size=batch_size,
+                segment_length=segment_length,
+                burn_in_gradient=gradient,
+            )
+            if has(rows, **key):
+                continue
+            fields: dict[str, Any] = {}
+            if segment_length:
+                fields = {**SEGMENTS, **key}
+                del fields["task"]
+            seeds = range(SEARCH_SEED, SEARCH_SEED + (1 if tiny else SEARCH_SEEDS))
+            began = time.process_time()
+            acting = "carry" if segment_length else "window"
+            found = returns(task, fields, seeds, 10 if tiny else SEARCH_EPISODES, tiny)[acting]
+            row = {
+                **key,
+                "mean": round(float(np.mean(found)), 3),
+                "worst_seed": round(min(found), 3),
+                "cpu_seconds": round(time.process_time() - began),
+            }
+            print(row, flush=True)
+            rows = pd.concat([rows, pd.DataFrame([row])], ignore_index=True)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            rows.to_csv(path, index=False)
+
+
+def compare(out: pathlib.Path, tasks: list[str], seeds: int, tiny: dict[str, Any]) -> pd.DataFrame:
+    """Fill in the table of pairs, a row per task, way and seed."""
+    path = out / "segments_returns.parquet"
+    rows = kept(path)
+    for task in tasks:
+        env, _, length = TASKS[task]
+        for way, fields in (("windows", {}), ("segments", CHOSEN[env, length])):
+            text = repr(sorted(fields.items()))
+            missing = [s for s in range(seeds) if not has(rows, task=task, setting=text, seed=s)]
+            if not missing:
+                continue
+            found = returns(
+                task, fields, range(min(missing), seeds), 10 if tiny else EPISODES, tiny
+            )
+            new = pd.DataFrame(
+                {
+                    "task": task,
+                    "way": way,
+                    "setting": text,
+                    "seed": range(min(missing), seeds),
+                    "normalised": found["window" if way == "windows" else "carry"],
+                    "acting_otherwise": found["carry" if way == "windows" else "window"],
+                }
+            )
+            print(new.to_string(header=False), flush=True)
+            old = rows if rows.empty else rows[(rows["task"] != task) | (rows["way"] != way)]
+            rows = pd.concat([old, new], ignore_index=True)
+            out.mkdir(parents=True, exist_ok=True)
+            rows.to_parquet(path, index=False)
+    return rows
+
+
+def table(rows: pd.DataFrame, shares: dict[str, float]) -> str:
+    """A line per task: both means, the paired difference with its 95% interval, and the time."""
+    body = []
+    for task in TASKS:
+        own = rows[rows["task"] == task]
+        paired = own.pivot(index="seed", columns="way", values="normalised").dropna()
+        if len(paired.columns) < 2 or paired.empty:
+            continue
+        other = own[own["way"] == "windows"]["acting_otherwise"].mean()
+        difference = (paired["segments"] - paired["windows"]).to_numpy()
+        draws = np.random.default_rng(0).choice(difference, (10_000, len(difference))).mean(axis=1)
+        low, high = np.percentile(draws, (2.5, 97.5))
+        env, _, length = TASKS[task]
+        chosen = CHOSEN[env, length]
+        m = chosen["segment_length"]
+        body.append(
+            [
+                task,
+                f"{chosen['batch_size'] // m} x {m}",
+                f"{paired['windows'].mean():.3f} (worst {paired['windows'].min():.3f})",
+                f"{other:.3f}",
+                f"{paired['segments'].mean():.3f} (worst {paired['segments'].min():.3f})",
+                f"{difference.mean():+.3f} [{low:+.3f}, {high:+.3f}]",
+                f"{shares[task]:.2f}" if task in shares else "not measured",
+                "holds" if high >= 0 else "loses",
+            ]
+        )
+    header = ["task", "segments", "windows", "windows, carry", "segments", "difference", "time", ""]
+    return markdown_table(header, body)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
+    parser.add_argument("--search", action="store_true", help="candidates, on unreported seeds")
+    parser.add_argument("--report", action="store_true", help="the table of what there is")
+    parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS), metavar="T")
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
+    options = parser.parse_args(arguments)
+    tiny: dict[str, Any] = {}
+    if options.quick:
+        tiny = {"total_steps": 260, "learning_starts": 250, "hidden_size": 4, "eval_every": 260}
+        options.tasks, options.seeds = options.tasks[:1], 1
+    if options.search:
+        search(options.out / "segments_search.csv", options.tasks, tiny)
+        return 0
+    if options.report:
+        rows = kept(options.out / "segments_returns.parquet")
+    else:
+        rows = compare(options.out, options.tasks, options.seeds, tiny)
+    shares = {}
+    if not options.quick:
+        for task in options.tasks:
+            env, disturbance, length = TASKS[task]
+            if disturbance in ("ar1-slip", "hidden"):
+                shares[task] = cost(task, CHOSEN[env, length], seconds=1.5, repeats=5)
+    text = table(rows, shares)
+    facts = provenance(
+        agent=AGENT,
+        width=WIDTH,
+        episodes=EPISODES,
+        difference="of paired seeds, mean and 95% bootstrap interval",
+        time="of a step with segments, as a share of the windows', in turns on the rover",
+        settings={"rover": ROVER, "pendulum": PENDULUM},
+    )
+    write_results(options.out, "segments_returns", rows, text, facts)
+    print(text)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,54 @@
+"""What is refused of segments and of acting with a carry, in one line and before compilation."""
+
+import warnings
+
+import pytest
+
+import rtd3jax as rtd
+from rtd3jax.training.run import make_jobs
+
+
+@pytest.mark.parametrize(
+    "fields, line",
+    [
+        (dict(segment_length=7), r"segment_length \(7\) does not divide batch_size \(100\)"),
+        (dict(segment_length=0), "segment_length must be at least 1"),
+        (dict(segment_length=-5), "segment_length must be at least 0"),
+        (dict(segment_length=2.5), "segment_length must be an integer"),
+        (
+            dict(segment_length=50, replay_capacity=40, batch_size=50),
+            r"segment_length \(50\) is longer than the replay \(40\)",
+        ),
+        (dict(replay="segment"), "did you mean 'segments'"),
+        (dict(replay=None), "replay None is unknown"),
+        (dict(replay="windows", segment_length=10), "needs replay='segments'"),
+        (dict(acting="carries"), "acting 'carries' is unknown; did you mean 'carry'"),
+        (dict(burn_in_gradient="yes"), "burn_in_gradient must be True or False"),
+    ],
+)
+def test_a_wrong_value_is_one_line(fields, line):
+    with pytest.raises(rtd.UserError, match=line):
+        rtd.Config(**{"replay": "segments", **fields})
+
+
+def test_a_segment_is_not_longer_than_an_episode():
+    env = rtd.make("rover", "ar1-slip", max_steps_in_episode=20)
+    config = rtd.Config(replay="segments", segment_length=25)
+    with pytest.raises(rtd.UserError, match=r"longer than an episode ever gets \(20 steps\)"):
+        make_jobs(env, config, [0])
+
+
+def test_a_carry_beyond_the_windows_is_warned_of():
+    with pytest.warns(UserWarning, match="trained on windows has never seen a carry older"):
+        rtd.Config(acting="carry")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert rtd.Config(replay="segments").acting == "carry"
+        assert rtd.Config(replay="segments", acting="window").acting == "window"
+        config = rtd.Config("td3", replay="segments", segment_length=10, acting="carry")
+        assert (config.replay, config.acting, config.segment_length) == ("windows", "window", 0)
+
+
+@pytest.mark.parametrize("batch_size, length", [(100, 10), (50, 10), (8, 8), (14, 7), (13, 1)])
+def test_the_default_length_divides_the_batch(batch_size, length):
+    assert rtd.Config(replay="segments", batch_size=batch_size).segment_length == length
