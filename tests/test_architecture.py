@@ -10,32 +10,23 @@ import rtd3jax
 ROOT = pathlib.Path(rtd3jax.__file__).parent
 LAYERS = {
     "errors": 0,
-    "files": 1,
-    "machine": 1,
-    "programs": 1,
-    "versions": 1,
+    "system": 1,
     "registries": 1,
     "config": 2,
     "envs": 3,
     "agents": 3,
-    "deploy": 4,
-    "fit": 5,
-    "policy": 5,
-    "value_iteration": 5,
-    "pendulum_belief": 6,
-    "pendulum_filter": 7,
-    "evaluate": 6,
-    "saved": 6,
-    "play_gymnasium": 6,
-    "ceilings": 7,
-    "training": 7,
-    "study": 8,
-    "load": 9,
-    "sweep": 9,
-    "report": 9,
-    "transfer": 9,
-    "export": 10,
+    "policies": 4,
+    "evaluation": 5,
+    "training": 6,
+    "study": 7,
+    "policies.load": 8,
+    "sweep": 8,
+    "report": 8,
+    "transfer": 8,
+    "export": 9,
 }
+"""The height of each folder and module. `policies.load` opens run directories: it is above `study`,
+and so above the folder that it lies in."""
 
 
 def imported(source, modules):
@@ -57,8 +48,9 @@ def imported(source, modules):
 
 
 def layer_of(module):
-    """The layer's name: the module's first part below the package."""
-    return module.split(".")[1] if "." in module else ""
+    """The layer's name: the module's first part below the package, or its own entry."""
+    name = module.partition(".")[2]
+    return name if name in LAYERS else name.partition(".")[0]
 
 
 def upward(module, imports):

@@ -259,7 +259,7 @@ def test_a_cell_that_raises_does_not_stop_the_others(tmp_path, monkeypatch, caps
 def test_a_full_disk_is_one_line_and_loses_nothing(tmp_path, monkeypatch, capsys):
     import errno
 
-    from rtd3jax import files
+    from rtd3jax.system import files
 
     real, written = files.os.fsync, []
 

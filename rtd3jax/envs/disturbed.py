@@ -10,7 +10,7 @@ from gymnax.environments import environment, spaces
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.identity import ValueIdentity, strong
 from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT, describe, foreign_code
-from rtd3jax.envs.process import Chain, Nothing, Process
+from rtd3jax.envs.processes.process import Chain, Nothing, Process
 from rtd3jax.errors import UserError, nearest
 
 REWARDS_FROM = ("state", "observation")

@@ -11,7 +11,7 @@ from typing import Any
 
 import gymnax
 
-from rtd3jax.envs.disturbances import DampedSine, GaussianNoise, Hidden, Pulses, Sine
+from rtd3jax.envs.compat.gymnax import make_gymnax
 from rtd3jax.envs.disturbed import (
     CHANNELS,
     Disturbed,
@@ -21,13 +21,12 @@ from rtd3jax.envs.disturbed import (
     sequence,
 )
 from rtd3jax.envs.entry import check_gymnax
-from rtd3jax.envs.faults import Delay, Dropout, GainDrift, OrnsteinUhlenbeck, Quantisation
-from rtd3jax.envs.identity import ValueIdentity, strong, with_identity
-from rtd3jax.envs.interface import foreign_code
-from rtd3jax.envs.pendulum import Pendulum
-from rtd3jax.envs.process import Nothing, Process, require
-from rtd3jax.envs.rover import Rover
-from rtd3jax.envs.slip import Ar1Slip, SineSlip
+from rtd3jax.envs.pendulum.environment import Pendulum
+from rtd3jax.envs.processes.disturbances import DampedSine, GaussianNoise, Hidden, Pulses, Sine
+from rtd3jax.envs.processes.faults import Delay, Dropout, GainDrift, OrnsteinUhlenbeck, Quantisation
+from rtd3jax.envs.processes.process import Nothing, Process, require
+from rtd3jax.envs.rover.environment import Rover
+from rtd3jax.envs.rover.slip import Ar1Slip, SineSlip
 from rtd3jax.errors import UserError, nearest
 
 _PROCESSES: dict[str, dict[str, Process]] = {
@@ -101,7 +100,7 @@ def make(env_id: str, disturbance: str = "none", **parameters: Any) -> Any:
     if env_id in _registered:
         return _disturbed(env_id, _registered[env_id][0], disturbance, parameters)
     if env_id in _PROCESSES or env_id in gymnax.registered_envs:
-        base = {"pendulum": Pendulum, "rover": Rover}.get(env_id, lambda: _make_gymnax(env_id))()
+        base = {"pendulum": Pendulum, "rover": Rover}.get(env_id, lambda: make_gymnax(env_id))()
         return _disturbed(env_id, base, disturbance, parameters)
     known = (*ENVIRONMENTS, *_constructors, *_registered, *gymnax.registered_envs)
     raise UserError(f"unknown environment {env_id!r}{nearest(env_id, known)}")
@@ -249,7 +248,7 @@ def _disturbed(env_id: str, base: Any, disturbance: str, parameters: dict[str, A
         params = params.replace(slip=on("slip"))
         base = Rover(params)
     elif env_id in gymnax.registered_envs:
-        base = _make_gymnax(env_id, params)
+        base = make_gymnax(env_id, params)
     bare = env_id == "rover" or env_id in gymnax.registered_envs
     if bare and all(isinstance(on(channel), Nothing) for channel in CHANNELS):
         return base
@@ -277,51 +276,6 @@ def _check_owners(
                 f"{what}: {name!r} could be that of {' or '.join(owners)}; "
                 "join such disturbances with rtd.disturb"
             )
-
-
-class _Preset(ValueIdentity):
-    """A gymnax environment whose ``default_params`` are given, and whose states are strong.
-
-    It is foreign code, which strict promotion would refuse.
-    """
-
-    _preset_id: str
-    _preset_params: Any
-
-    def identity(self) -> tuple:
-        """The id: gymnax never lets an id be made anew by another factory."""
-        return (self._preset_id,)
-
-    @property
-    def default_params(self) -> Any:
-        """gymnax's, with the parameters given to ``make``."""
-        return self._preset_params
-
-    def step(self, key: Any, state: Any, action: Any, params: Any = None) -> tuple:
-        """Step as gymnax does, with a strong state."""
-        with foreign_code():
-            observation, state, *rest = super().step(key, state, action, params)
-        return (observation, strong(state), *rest)
-
-    def reset(self, key: Any, params: Any = None) -> tuple:
-        """Reset as gymnax does, with a strong state."""
-        with foreign_code():
-            observation, state = super().reset(key, params)
-        return observation, strong(state)
-
-
-def _make_gymnax(env_id: str, params: Any = None) -> Any:
-    """gymnax's environment with ``params`` for its defaults; None means gymnax's own."""
-    try:
-        base, defaults = gymnax.make(env_id)
-    except Exception as error:
-        raise UserError(
-            f"environment {env_id} cannot be made: {type(error).__name__}: {error}"
-        ) from error
-    env: Any = object.__new__(with_identity(_Preset, type(base)))  # type: ignore[arg-type]
-    params = defaults if params is None else params
-    env.__dict__.update(vars(base), _preset_id=env_id, _preset_params=params)
-    return env
 
 
 def _assign(

@@ -39,9 +39,9 @@ from rtd3jax.study.rundir import (
     parse_log,
     steps_reached,
 )
+from rtd3jax.system.versions import versions_of
 from rtd3jax.training.checkpoint import checkpoint_steps
 from rtd3jax.training.lanes import Job, workers
-from rtd3jax.versions import versions_of
 
 TASKS = "cluster.jsonl"
 """A line per task that ended: its cell, where and when it ran, and from which steps it went on."""

@@ -8,8 +8,8 @@ import jax
 from rtd3jax.agents.agent import count_parameters
 from rtd3jax.config import Config
 from rtd3jax.errors import UserError
-from rtd3jax.machine import memory_limit
 from rtd3jax.registries import AGENTS
+from rtd3jax.system.machine import memory_limit
 from rtd3jax.training.lanes import Job, workers
 
 _GRADIENTS = 1.3

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from rtd3jax.evaluate import both_returns
-from rtd3jax.policy import constant_policy, random_policy
+from rtd3jax.evaluation.rollout import both_returns
+from rtd3jax.policies.baselines import constant_policy, random_policy
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.rundir import Reference
 

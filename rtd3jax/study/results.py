@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from rtd3jax.errors import UserError
-from rtd3jax.files import user_path, write_bytes_atomically
+from rtd3jax.system.files import user_path, write_bytes_atomically
 
 # Untrained policies evaluated for comparison. Their EPISODES rows carry history_length 0 and a
 # negative seed, because neither has a meaning for them.

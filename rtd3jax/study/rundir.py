@@ -18,9 +18,8 @@ import numpy as np
 
 from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
-from rtd3jax.files import flatten, read_arrays, user_path, write_arrays, write_bytes_atomically
-from rtd3jax.policy import FORMAT, Policy
-from rtd3jax.saved import read_interface, restore_policy
+from rtd3jax.policies.serialization import read_interface, restore_policy
+from rtd3jax.policies.trained import FORMAT, Policy
 from rtd3jax.study.ceilings import ceilings_of
 from rtd3jax.study.figures import final_returns, learning_curves
 from rtd3jax.study.lock import deriver, is_held
@@ -35,9 +34,16 @@ from rtd3jax.study.results import (
     write_table,
 )
 from rtd3jax.study.summary import summary_markdown
+from rtd3jax.system.files import (
+    flatten,
+    read_arrays,
+    user_path,
+    write_arrays,
+    write_bytes_atomically,
+)
+from rtd3jax.system.versions import versions_of
 from rtd3jax.training.checkpoint import checkpoint_steps
 from rtd3jax.training.run import check_seeds
-from rtd3jax.versions import versions_of
 
 _CURVE_ARRAYS = ("steps", "returns", "true_returns")
 _FINAL_ARRAYS = ("final_returns", "final_true_returns")

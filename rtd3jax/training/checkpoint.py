@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from rtd3jax.errors import UserError
-from rtd3jax.files import read_arrays, write_arrays
+from rtd3jax.system.files import read_arrays, write_arrays
+from rtd3jax.system.versions import versions_of
 from rtd3jax.training.loop import Lane, LaneState, Program
-from rtd3jax.versions import versions_of
 
 DEFAULT_SECONDS = 300.0
 """Between checkpoints of a lane, unless they are so large that they take their time."""

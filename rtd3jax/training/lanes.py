@@ -19,8 +19,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rtd3jax.machine import cores
-from rtd3jax.programs import make_room, on_full
+from rtd3jax.system.machine import cores
+from rtd3jax.system.program_cache import make_room, on_full
 from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.loop import HEALTHY, Lane, LaneState, Program
 

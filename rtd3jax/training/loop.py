@@ -29,8 +29,8 @@ from rtd3jax.agents.replay import (
 )
 from rtd3jax.config import Config, traced_fields
 from rtd3jax.envs.interface import action_bounds, foreign_code
-from rtd3jax.evaluate import episode_returns
-from rtd3jax.policy import Policy
+from rtd3jax.evaluation.rollout import episode_returns
+from rtd3jax.policies.trained import Policy
 from rtd3jax.training.metrics import (
     Averages,
     averaged,

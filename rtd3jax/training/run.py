@@ -12,8 +12,8 @@ from rtd3jax.config import Config
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
-from rtd3jax.files import user_path
-from rtd3jax.policy import Policy
+from rtd3jax.policies.trained import Policy
+from rtd3jax.system.files import user_path
 from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.lanes import (
     Group,

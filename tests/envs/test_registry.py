@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from rtd3jax.envs import registry
-from rtd3jax.envs.disturbances import GaussianNoise, Hidden, Sine
 from rtd3jax.envs.disturbed import Disturbed
-from rtd3jax.envs.faults import Delay, Dropout
-from rtd3jax.envs.process import Chain
+from rtd3jax.envs.processes.disturbances import GaussianNoise, Hidden, Sine
+from rtd3jax.envs.processes.faults import Delay, Dropout
+from rtd3jax.envs.processes.process import Chain
 from rtd3jax.envs.registry import DISTURBANCES, ENVIRONMENTS, make, parse_disturbance, register
 from rtd3jax.errors import UserError, nearest
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from rtd3jax.errors import UserError, first_line
-from rtd3jax.files import user_path, write_bytes_atomically
 from rtd3jax.study.ceilings import ceilings_of
 from rtd3jax.study.report.data import study_data, tables_of
 from rtd3jax.study.report.playback import recordings
@@ -18,7 +17,8 @@ from rtd3jax.study.report.transfer import FILE as TRANSFER
 from rtd3jax.study.report.transfer import transfer_data
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.statistics import seed_means
-from rtd3jax.versions import versions_of
+from rtd3jax.system.files import user_path, write_bytes_atomically
+from rtd3jax.system.versions import versions_of
 
 NAME = "report.html"
 _GENERATOR = '<meta name="generator" content="rtd3jax">'

@@ -17,22 +17,21 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from rtd3jax.envs.disturbances import Hidden
 from rtd3jax.envs.disturbed import Disturbed
 from rtd3jax.envs.entry import parameters_of
-from rtd3jax.envs.interface import describe, foreign_code
-from rtd3jax.envs.pendulum import Pendulum
-from rtd3jax.envs.process import Chain
-from rtd3jax.envs.rover import Rover
+from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT, describe, foreign_code
+from rtd3jax.envs.pendulum.environment import Pendulum
+from rtd3jax.envs.processes.disturbances import Hidden
+from rtd3jax.envs.processes.process import Chain
+from rtd3jax.envs.rover.environment import Rover
 from rtd3jax.errors import UserError, first_line
-from rtd3jax.evaluate import DEFAULT_STEP_LIMIT
-from rtd3jax.files import write_bytes_atomically
-from rtd3jax.fit import check_fit
-from rtd3jax.programs import make_room
+from rtd3jax.policies.fit import check_fit
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.report.data import rows_of
 from rtd3jax.study.results import number
 from rtd3jax.study.rundir import RunDirectory
+from rtd3jax.system.files import write_bytes_atomically
+from rtd3jax.system.program_cache import make_room
 
 FORMAT = 1
 EPISODES = 2
