@@ -6,7 +6,8 @@ from rtd3jax.agents.memory import Memory, register_memory
 from rtd3jax.agents.networks import NetworkSpec
 from rtd3jax.agents.variants import ALGORITHMS, Variant, register_agent
 from rtd3jax.config import Config
-from rtd3jax.envs.about import Ceiling
+from rtd3jax.envs.about import Ceiling, Drawing
+from rtd3jax.envs.builtin import DISTURBANCES, ENVIRONMENTS
 from rtd3jax.envs.check import Finding, check_env, find_problems
 from rtd3jax.envs.compat.brax import from_brax
 from rtd3jax.envs.compat.gymnasium import register_with_gymnasium, to_gymnasium
@@ -15,7 +16,7 @@ from rtd3jax.envs.pendulum.filter import filter_policy
 from rtd3jax.envs.processes.disturbances import DampedSine, GaussianNoise, Hidden, Pulses, Sine
 from rtd3jax.envs.processes.faults import Delay, Dropout, GainDrift, OrnsteinUhlenbeck, Quantisation
 from rtd3jax.envs.processes.process import Chain, Nothing, Process, Sum
-from rtd3jax.envs.registry import DISTURBANCES, ENVIRONMENTS, make, register
+from rtd3jax.envs.registry import make, register
 from rtd3jax.envs.rover.optimum import bayes_policy
 from rtd3jax.errors import UserError
 from rtd3jax.evaluation.ceiling import ceiling
@@ -39,6 +40,7 @@ __all__ = [
     "Config",
     "DampedSine",
     "Delay",
+    "Drawing",
     "Dropout",
     "Failure",
     "Finding",

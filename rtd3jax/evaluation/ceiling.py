@@ -5,33 +5,38 @@ from typing import Any
 import numpy as np
 
 from rtd3jax.envs.about import Ceiling
-from rtd3jax.envs.disturbed import Disturbed
-from rtd3jax.envs.pendulum import optimum as pendulum
-from rtd3jax.envs.pendulum.environment import Pendulum
-from rtd3jax.envs.rover import optimum as rover
-from rtd3jax.envs.rover.environment import Rover
-from rtd3jax.errors import UserError
+from rtd3jax.envs.interface import environment_name
+from rtd3jax.envs.registry import about_of
+from rtd3jax.errors import UserError, first_line
 from rtd3jax.evaluation.rollout import evaluate
 
 
-def ceiling(env: Any, episodes: int = 20_000, seed: int = 0) -> Ceiling:
+def ceiling(
+    env: Any, episodes: int = 20_000, seed: int = 0, *, env_id: str | None = None
+) -> Ceiling:
     """The best possible mean return of ``env``, or an upper bound that is named as such.
 
     Args:
-        env: a rover, or a pendulum, disturbed or not.
-        episodes: of the rover, how many random ones to average. The pendulum's ceiling is an
-            integral over all starts and needs none.
-        seed: of the rover's episodes.
+        env: an environment that was registered with a ceiling, as the rover and the pendulum are;
+            disturbed or not.
+        episodes: how many to average where the ceiling is the mean of random episodes. The
+            pendulum's is an integral over all starts and needs none.
+        seed: of these episodes.
+        env_id: the id under which it was registered; by default that of an equal environment.
 
     Raises:
-        UserError: for a world whose ceiling is not known.
+        UserError: for an environment whose ceiling is not known.
     """
-    base = env.base if isinstance(env, Disturbed) else env
-    if isinstance(base, Pendulum):
-        return pendulum.best_return(env)
-    if not isinstance(env, Rover):
-        raise UserError("the ceiling is known for the rover and the pendulum alone")
-    best = rover.best_return(env, episodes, seed)
+    best_return = about_of(env, env_id).ceiling
+    name = environment_name(env)
+    if best_return is None:
+        raise UserError(f"no ceiling of {name} is known: rtd.register(..., ceiling=...) tells one")
+    try:
+        best = best_return(env, episodes, seed)
+    except UserError:
+        raise
+    except Exception as error:  # a user's function may do anything
+        raise UserError(f"the ceiling of {name} failed: {first_line(error)}") from error
     if isinstance(best, Ceiling):
         return best
     returns = np.asarray(evaluate(best, env, episodes, seed), np.float64)

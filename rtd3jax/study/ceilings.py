@@ -32,7 +32,7 @@ def ceilings_of(
         name = " | ".join(world)
         if name not in kept and compute:
             try:
-                kept[name] = _entry(ceiling(cell.make_env()))
+                kept[name] = _entry(ceiling(cell.make_env(), env_id=cell.env))
             except UserError as error:
                 found[world] = {"missing": str(error)}
         if name in kept:

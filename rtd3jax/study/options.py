@@ -11,7 +11,7 @@ import jax
 
 from rtd3jax.agents.variants import ALGORITHMS
 from rtd3jax.config import Config
-from rtd3jax.envs.registry import DISTURBANCES, ENVIRONMENTS
+from rtd3jax.envs.builtin import DISTURBANCES, ENVIRONMENTS
 from rtd3jax.errors import UserError
 from rtd3jax.registries import AGENTS
 from rtd3jax.study.command import add_import, show_what_can_be_shown

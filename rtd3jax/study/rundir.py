@@ -29,7 +29,7 @@ from rtd3jax.study.results import (
     CURVES,
     EPISODES,
     METRICS,
-    REFERENCES,
+    REFERENCE_SEED,
     read_table,
     write_table,
 )
@@ -446,13 +446,12 @@ def cell_name(cell: Cell) -> str:
 
 
 def _reference_rows(reference: Reference) -> list[dict[str, Any]]:
-    assert reference.name in REFERENCES
     key = {
         "env": reference.env,
         "disturbance": reference.disturbance,
         "algorithm": reference.name,
         "history_length": 0,
-        "seed": -1,
+        "seed": REFERENCE_SEED,
     }
     pairs = zip(reference.returns, reference.true_returns, strict=True)
     return [

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from gymnax.environments import spaces
 
+from rtd3jax.envs.builtin import DISTURBANCES
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import (
     check_final_observation,
@@ -22,7 +23,7 @@ from rtd3jax.envs.interface import (
     trace_reset,
     trace_step,
 )
-from rtd3jax.envs.registry import DISTURBANCES, make
+from rtd3jax.envs.registry import make
 from rtd3jax.errors import UserError
 
 NAMESPACE = "rtd3jax"

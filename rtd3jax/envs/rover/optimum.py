@@ -82,7 +82,18 @@ def bayes_policy(env: Any, model: Process | None = None) -> BayesPolicy:
 
 
 def best_return(env: Any, episodes: int, seed: int) -> Ceiling | BayesPolicy:
-    """The best policy of a rover, whose return is its ceiling; under the sine slip, a bound."""
+    """The best policy of a rover, whose return is its ceiling; under the sine slip, a bound.
+
+    Args:
+        env: a rover.
+        episodes: how many the bound averages.
+        seed: of these episodes.
+
+    Raises:
+        UserError: for a rover with faults, or a slip whose moments are not known.
+    """
+    if not isinstance(env, Rover):
+        raise UserError("the rover's ceiling is known under slip alone, without other faults")
     if isinstance(env.default_params.slip, SineSlip):
         return _sine_bound(env.default_params, episodes, seed)
     return bayes_policy(env)

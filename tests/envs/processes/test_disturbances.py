@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rtd3jax.envs.builtin import DISTURBANCES
 from rtd3jax.envs.disturbed import Disturbed, DisturbedParams
 from rtd3jax.envs.pendulum.environment import Pendulum
 from rtd3jax.envs.processes.disturbances import DampedSine, GaussianNoise, Hidden, Pulses, Sine
 from rtd3jax.envs.processes.process import Chain, Process
-from rtd3jax.envs.registry import DISTURBANCES, FAULTS, make
+from rtd3jax.envs.registry import FAULTS, make
 from rtd3jax.errors import UserError
 
 EPISODES, STEPS = 1000, 200

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rtd3jax.envs.registry import DISTURBANCES, FAULTS, make
+from rtd3jax.envs.builtin import DISTURBANCES
+from rtd3jax.envs.registry import FAULTS, make
 
 STEPS = 200
 
