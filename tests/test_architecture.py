@@ -10,6 +10,7 @@ import rtd3jax
 ROOT = pathlib.Path(rtd3jax.__file__).parent
 LAYERS = {
     "errors": 0,
+    "protocols": 0,
     "system": 1,
     "registries": 1,
     "config": 2,
@@ -112,6 +113,40 @@ def test_the_checks_can_fail():
     wrong = upward("rtd3jax.envs.rover", graph["rtd3jax.envs.rover"])
     assert wrong == ["rtd3jax", "rtd3jax.training.run"]
     assert circle(graph) == ["rtd3jax.study.hosts", "rtd3jax.study.launch", "rtd3jax.sweep"]
+
+
+def untyped(found):
+    """How many parameters functions have, and those that are typed ``Any``."""
+    count, vague = 0, []
+    for module, source in found.items():
+        for node in ast.walk(ast.parse(source)):
+            if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                continue
+            given = node.args
+            parameters = [*given.posonlyargs, *given.args, *given.kwonlyargs]
+            parameters += [p for p in (given.vararg, given.kwarg) if p is not None]
+            for parameter in parameters:
+                if parameter.arg in ("self", "cls"):
+                    continue
+                count += 1
+                if parameter.annotation and ast.unparse(parameter.annotation) == "Any":
+                    vague.append(f"{module}.{node.name}({parameter.arg})")
+    return count, vague
+
+
+def test_few_parameters_are_typed_any():
+    """`rtd3jax.protocols` has types for an environment and a policy of anyone's."""
+    count, vague = untyped(sources())
+    assert len(vague) <= 0.03 * count, vague
+    planted = "def play(policy: Any, seed: int, *, env: Any = None, **more: Any): ..."
+    found = ["m.play(policy)", "m.play(env)", "m.play(more)"]
+    assert untyped({"m": planted}) == (4, found)
+
+
+def test_few_modules_lie_at_the_root():
+    commands = {"sweep", "report", "transfer", "export"}
+    modules = {path.stem for path in ROOT.glob("*.py")} - commands - {"__init__"}
+    assert len(modules) <= 6, modules
 
 
 def test_public_names_exist():

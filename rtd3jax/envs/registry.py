@@ -8,7 +8,7 @@ import numbers
 import re
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from typing import Any, cast
 
 import gymnax
 
@@ -33,6 +33,7 @@ from rtd3jax.envs.processes.faults import (
 )
 from rtd3jax.envs.processes.process import Nothing, Process, require
 from rtd3jax.errors import UserError, nearest
+from rtd3jax.protocols import EnvironmentLike
 
 _FAULTS: dict[str, tuple[str, Process]] = {
     "dropout": ("observation", Dropout()),
@@ -66,7 +67,7 @@ class _Entry:
         about: baselines, ceiling and drawing.
     """
 
-    env: Any
+    env: EnvironmentLike | None
     construct: Callable[..., Any] | None
     disturbances: Mapping[str, tuple[str, Process]]
     registrant: str
@@ -108,7 +109,7 @@ def make(env_id: str, disturbance: str = "none", **parameters: Any) -> Any:
 
 def register(
     env_id: str,
-    env: Any,
+    env: EnvironmentLike | Callable[..., Any],
     disturbances: Mapping[str, Process | tuple[str, Process]] | None = None,
     *,
     positive: Iterable[str] = (),
@@ -163,9 +164,10 @@ def register(
                 f"{env_id!r}: disturbances and what else is known of an environment are for an "
                 "environment, not for a function"
             )
-        _entries[env_id] = _Entry(None, env, {}, module)
+        _entries[env_id] = _Entry(None, cast("Callable[..., Any]", env), {}, module)
         return
     check_gymnax(env)
+    env = cast("EnvironmentLike", env)
     named = _named_processes(env_id, env, disturbances or {}, try_disturbances)
     _check_extras(env_id, env, named, extras)
     known = next((e.about for e in _entries.values() if e.env is not None and e.env == env), None)
@@ -174,7 +176,7 @@ def register(
     _entries[env_id] = _Entry(env, None, named, module, *extras)
 
 
-def about_of(env: Any, env_id: str | None = None) -> About:
+def about_of(env: EnvironmentLike, env_id: str | None = None) -> About:
     """What was registered with ``env_id``; without it, with an environment that equals ``env``.
 
     ``env`` may be disturbed. What nobody registered has neither baselines, ceiling nor drawing.
@@ -209,7 +211,7 @@ _PACKAGE = __name__.partition(".")[0]
 
 def _check_extras(
     env_id: str,
-    env: Any,
+    env: EnvironmentLike,
     named: Mapping[str, tuple[str, Process]],
     extras: tuple[tuple[str, ...], tuple[str, ...], Callable[[Any], Any] | None, About],
 ) -> None:
@@ -246,7 +248,7 @@ def _check_extras(
 
 
 def _named_processes(
-    env_id: str, env: Any, disturbances: Mapping[str, Any], tried: bool
+    env_id: str, env: EnvironmentLike, disturbances: Mapping[str, Any], tried: bool
 ) -> dict[str, tuple[str, Process]]:
     """Channel and process of each name, each ``tried`` on the environment."""
     named = dict(_NONE)
@@ -308,7 +310,8 @@ def _lookup(env_id: str, entry: _Entry, disturbance: str) -> list[tuple[str, Pro
 
 def _disturbed(env_id: str, entry: _Entry, disturbance: str, parameters: dict[str, Any]) -> Any:
     """The entry's environment, disturbed, with ``parameters`` shared out among them."""
-    base, names = entry.env, disturbance.split("+")
+    base: Any = entry.env
+    names = disturbance.split("+")
     channels, processes = zip(*_lookup(env_id, entry, disturbance), strict=True)
     rest, reward_from = dict(parameters), "state"
     also: tuple[str, ...] = ()
@@ -382,7 +385,7 @@ def _assign(
     )
 
 
-def _settable(owner: Any) -> dict[str, Any]:
+def _settable(owner: object) -> dict[str, Any]:
     """The fields that a plain value can set, with their defaults."""
     if not dataclasses.is_dataclass(owner):  # others' parameters can be anything
         return {}
@@ -390,7 +393,7 @@ def _settable(owner: Any) -> dict[str, Any]:
     return {name: v for name, v in values.items() if isinstance(v, bool | int | float | tuple)}
 
 
-def _coerce(what: str, name: str, value: Any, default: Any) -> Any:
+def _coerce(what: str, name: str, value: object, default: bool | int | float | tuple) -> Any:
     """Return ``value`` as the kind of thing that ``default`` is, or raise UserError."""
     wrong = f"{what}: {name}={value!r} must be"
     if isinstance(default, bool):
@@ -403,7 +406,7 @@ def _coerce(what: str, name: str, value: Any, default: Any) -> Any:
             raise UserError(f"{wrong} a list of whole numbers")
         return tuple(int(item) for item in items)
     if isinstance(default, int):
-        if not _is_integer(value):
+        if not isinstance(value, numbers.Integral) or isinstance(value, bool):
             raise UserError(f"{wrong} a whole number")
         return int(value)
     if not isinstance(value, numbers.Real) or isinstance(value, bool) or not math.isfinite(value):
@@ -411,5 +414,5 @@ def _coerce(what: str, name: str, value: Any, default: Any) -> Any:
     return float(value)
 
 
-def _is_integer(value: Any) -> bool:
+def _is_integer(value: object) -> bool:
     return isinstance(value, numbers.Integral) and not isinstance(value, bool)

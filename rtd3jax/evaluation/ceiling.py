@@ -1,7 +1,5 @@
 """The best possible return of an environment, which no trained agent exceeds on average."""
 
-from typing import Any
-
 import numpy as np
 
 from rtd3jax.envs.about import Ceiling
@@ -9,10 +7,11 @@ from rtd3jax.envs.interface import environment_name
 from rtd3jax.envs.registry import about_of
 from rtd3jax.errors import UserError, first_line
 from rtd3jax.evaluation.rollout import evaluate
+from rtd3jax.protocols import EnvironmentLike
 
 
 def ceiling(
-    env: Any, episodes: int = 20_000, seed: int = 0, *, env_id: str | None = None
+    env: EnvironmentLike, episodes: int = 20_000, seed: int = 0, *, env_id: str | None = None
 ) -> Ceiling:
     """The best possible mean return of ``env``, or an upper bound that is named as such.
 

@@ -5,14 +5,18 @@ from typing import Any
 import gymnasium
 import jax
 import numpy as np
+from jax.typing import ArrayLike
 
 from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT
 from rtd3jax.errors import UserError
 from rtd3jax.policies.fit import check_fit
 from rtd3jax.policies.trained import Policy
+from rtd3jax.protocols import PolicyLike
 
 
-def run_in_gymnasium(policy: Any, gym_env: Any, episodes: int = 10, seed: int = 0) -> np.ndarray:
+def run_in_gymnasium(
+    policy: PolicyLike, gym_env: gymnasium.Env | str, episodes: int = 10, seed: int = 0
+) -> np.ndarray:
     """Returns of whole episodes: float64 [episodes].
 
     The action is clipped to the environment's bounds. An episode that has not ended after 10,000
@@ -46,7 +50,7 @@ def run_in_gymnasium(policy: Any, gym_env: Any, episodes: int = 10, seed: int = 
         env.close()
 
 
-def _play(policy: Any, env: Any, episodes: int, seed: int) -> np.ndarray:
+def _play(policy: PolicyLike, env: gymnasium.Env, episodes: int, seed: int) -> np.ndarray:
     space = _check_fit(policy, env)
     returns = np.zeros(episodes)
     # As seeds of their own: neighbouring seeds shall not share episodes.
@@ -61,24 +65,25 @@ def _play(policy: Any, env: Any, episodes: int, seed: int) -> np.ndarray:
             _check_finite(where, "policy's action", action)
             action = np.clip(np.asarray(action, space.dtype), space.low, space.high)
             observation, reward, terminated, truncated, _ = env.step(action)
+            reward = float(reward)
             _check_finite(where, "environment's reward", reward)
-            returns[index] += float(reward)
+            returns[index] += reward
             if terminated or truncated:
                 break
     return returns
 
 
-def _check_finite(where: str, what: str, value: Any) -> None:
+def _check_finite(where: str, what: str, value: ArrayLike) -> None:
     if not np.isfinite(np.asarray(value, np.float64)).all():
         raise UserError(f"{where} the {what} is {np.asarray(value).tolist()}, which is not finite")
 
 
 @jax.jit
-def _act(policy: Any, state: Any, observation: jax.Array) -> tuple[jax.Array, Any]:
+def _act(policy: PolicyLike, state: object, observation: jax.Array) -> tuple[jax.Array, Any]:
     return policy.step(state, observation)
 
 
-def _check_fit(policy: Any, env: Any) -> gymnasium.spaces.Box:
+def _check_fit(policy: PolicyLike, env: gymnasium.Env) -> gymnasium.spaces.Box:
     """The space of actions; UserError where policy and environment do not fit each other."""
     if not isinstance(env, gymnasium.Env):
         raise UserError(

@@ -1,7 +1,6 @@
 """Deterministic evaluation of any policy on any environment."""
 
 import functools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,16 +9,17 @@ from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT, describe, foreign_code
 from rtd3jax.errors import UserError
 from rtd3jax.policies.fit import check_fit
+from rtd3jax.protocols import EnvironmentLike, PolicyLike
 from rtd3jax.system.program_cache import make_room
 
 
 def evaluate(
-    policy: Any,
-    env: Any,
+    policy: PolicyLike,
+    env: EnvironmentLike,
     episodes: int = 100,
     seed: int = 0,
     *,
-    params: Any = None,
+    params: object = None,
     true_reward: bool = False,
 ) -> jax.Array:
     """Returns of whole episodes: float32 [episodes].
@@ -40,7 +40,7 @@ def evaluate(
 
 
 def both_returns(
-    policy: Any, env: Any, episodes: int, seed: int, *, params: Any = None
+    policy: PolicyLike, env: EnvironmentLike, episodes: int, seed: int, *, params: object = None
 ) -> tuple[jax.Array, jax.Array]:
     """Returns of the reward as given and of the true state's, from the same episodes.
 
@@ -69,7 +69,7 @@ def _episode_returns(policy, env, params, key, episodes):
 
 
 def episode_returns(
-    policy: Any, env: Any, params: Any, key: jax.Array, episodes: int
+    policy: PolicyLike, env: EnvironmentLike, params: object, key: jax.Array, episodes: int
 ) -> tuple[jax.Array, jax.Array]:
     """Returns of the trained and of the true reward, float32 [episodes] each; for use under jit."""
     policy_key, reset_key, step_key = jax.random.split(key, 3)

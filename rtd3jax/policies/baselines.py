@@ -1,15 +1,15 @@
 """Policies that need no training: the references of every table."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jax.typing import ArrayLike
 
 from rtd3jax.agents.bounds import Bounds
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
+from rtd3jax.protocols import EnvironmentLike
 
 
 @struct.dataclass
@@ -46,7 +46,7 @@ class RandomPolicy:
         return action.reshape(self.action_shape), state
 
 
-def constant_policy(action: Any) -> ConstantPolicy:
+def constant_policy(action: ArrayLike) -> ConstantPolicy:
     """The policy that always does ``action``: a number or [A] in the environment's units."""
     array = jnp.atleast_1d(jnp.asarray(action, jnp.float32))
     if not bool(jnp.all(jnp.isfinite(array))):
@@ -54,7 +54,7 @@ def constant_policy(action: Any) -> ConstantPolicy:
     return ConstantPolicy(array)
 
 
-def random_policy(env: Any, params: Any = None) -> RandomPolicy:
+def random_policy(env: EnvironmentLike, params: object = None) -> RandomPolicy:
     """The uniform-random policy of ``env``: the floor of every table."""
     interface = describe(env, parameters_of(env, params))
     bounds = Bounds(jnp.asarray(interface.action_low), jnp.asarray(interface.action_high))

@@ -1,17 +1,17 @@
 """Whether a policy and an environment fit each other: asked wherever the two meet."""
 
 import warnings
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from rtd3jax.errors import UserError
+from rtd3jax.protocols import PolicyLike
 
 
 def check_fit(
-    policy: Any,
+    policy: PolicyLike,
     observation_size: int,
     action_shape: tuple[int, ...],
     low: np.ndarray,
@@ -49,7 +49,7 @@ def check_fit(
     _warn_of_bounds(policy, low, high)
 
 
-def _action_shape(policy: Any, observation_size: int) -> tuple[int, ...] | None:
+def _action_shape(policy: PolicyLike, observation_size: int) -> tuple[int, ...] | None:
     """The shape of the policy's action; None where it cannot be found out without playing."""
     if hasattr(policy, "action_shape"):
         return tuple(policy.action_shape)
@@ -64,7 +64,7 @@ def _action_shape(policy: Any, observation_size: int) -> tuple[int, ...] | None:
     return getattr(traced, "shape", None)
 
 
-def _warn_of_bounds(policy: Any, low: np.ndarray, high: np.ndarray) -> None:
+def _warn_of_bounds(policy: PolicyLike, low: np.ndarray, high: np.ndarray) -> None:
     bounds = getattr(policy, "bounds", None)
     if bounds is None or isinstance(bounds.low, jax.core.Tracer):
         return

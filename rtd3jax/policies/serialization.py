@@ -198,5 +198,5 @@ def read_interface(path: str | os.PathLike, about: Mapping[str, Any]) -> Interfa
     return Interface(about["observation_size"], tuple(shape), size, low, high)
 
 
-def _is_count(value: Any, low: int) -> bool:
+def _is_count(value: object, low: int) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and low <= value < 2**31

@@ -25,7 +25,7 @@ _HEADROOM = 0.8
 def state_bytes(job: Job) -> int:
     """Bytes that a lane keeps: parameters, optimisers, replay, carries, environment; exact."""
 
-    def size(leaf: Any) -> int:
+    def size(leaf: jax.Array | jax.ShapeDtypeStruct) -> int:
         key = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
         return leaf.size * (8 if key else leaf.dtype.itemsize)
 

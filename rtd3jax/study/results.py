@@ -9,7 +9,7 @@ import io
 import math
 import os
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import SupportsFloat
 
 import numpy as np
 import pandas as pd
@@ -165,7 +165,7 @@ def reference_names(table: pd.DataFrame) -> list[str]:
     return sorted(names, key=lambda name: (name != "random", name))
 
 
-def number(value: Any) -> float | None:
+def number(value: SupportsFloat) -> float | None:
     """For JSON: five significant digits, or None for what is not finite."""
     value = float(value)
     return float(f"{value:.5g}") if math.isfinite(value) else None

@@ -81,12 +81,12 @@ def write_new(path: str | os.PathLike, data: bytes, overwrite: bool = False) -> 
         ) from error
 
 
-def write_arrays(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], about: Any) -> None:
+def write_arrays(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], about: object) -> None:
     """Write arrays as safetensors, with ``about`` (anything JSON) and a digest of the whole."""
     write_bytes_atomically(path, array_bytes(arrays, about))
 
 
-def array_bytes(arrays: Mapping[str, np.ndarray], about: Any) -> bytes:
+def array_bytes(arrays: Mapping[str, np.ndarray], about: object) -> bytes:
     """The content of the file that `write_arrays` writes."""
     arrays = {name: np.asarray(array, order="C") for name, array in arrays.items()}
     # One entry of metadata, because several would be written in no fixed order.
@@ -117,7 +117,7 @@ def read_arrays(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], Any]:
     return arrays, about
 
 
-def flatten(tree: Any, prefix: str = "") -> dict[str, np.ndarray]:
+def flatten(tree: object, prefix: str = "") -> dict[str, np.ndarray]:
     """A nested dict's arrays under dotted names."""
     if not isinstance(tree, dict):
         return {prefix: np.asarray(tree)}
@@ -139,7 +139,7 @@ def unflatten(flat: Mapping[str, np.ndarray]) -> dict[str, Any]:
     return tree
 
 
-def _digest(arrays: Mapping[str, np.ndarray], about: Any) -> str:
+def _digest(arrays: Mapping[str, np.ndarray], about: object) -> str:
     digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode())
     for name in sorted(arrays):
         array = arrays[name]

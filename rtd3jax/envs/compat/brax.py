@@ -6,13 +6,14 @@ within the state. Nothing of Brax is imported unless an environment is asked for
 """
 
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from gymnax.environments import environment, spaces
+from jax.typing import ArrayLike
 
 from rtd3jax.envs.identity import ValueIdentity, strong
 from rtd3jax.envs.interface import foreign_code
@@ -20,6 +21,30 @@ from rtd3jax.errors import UserError, nearest
 
 DEFAULT_EPISODE_LENGTH = 1_000
 """Steps, as in Brax and in MuJoCo Playground's control suite."""
+
+
+class BraxStateLike(Protocol):
+    """What such an environment's State has: arrays, or dicts of arrays."""
+
+    obs: Any
+    reward: Any
+    done: Any
+    metrics: Any
+    info: Any
+
+
+class BraxLike(Protocol):
+    """A Brax-style environment."""
+
+    @property
+    def action_size(self) -> int:
+        """Elements of an action, which lie within [-1, 1]."""
+
+    def reset(self, rng: jax.Array, /) -> Any:
+        """The first State of an episode."""
+
+    def step(self, state: Any, action: jax.Array, /) -> Any:
+        """The next State."""
 
 
 class BraxParams(struct.PyTreeNode):
@@ -47,7 +72,7 @@ class BraxEnv(ValueIdentity, environment.Environment):
 
     def __init__(
         self,
-        env: Any,
+        env: BraxLike,
         default_params: BraxParams,
         observation_key: str | None,
         keep: tuple[int, ...],
@@ -75,7 +100,7 @@ class BraxEnv(ValueIdentity, environment.Environment):
         return self._observe(brax), strong(BraxState(jnp.zeros((), jnp.int32), brax))
 
     def step_env(
-        self, key: jax.Array, state: BraxState, action: Any, params: BraxParams
+        self, key: jax.Array, state: BraxState, action: ArrayLike, params: BraxParams
     ) -> tuple[jax.Array, BraxState, jax.Array, jax.Array, dict[Any, Any]]:
         """One control step; ``key`` is not used, as the state has its own."""
         with foreign_code():
@@ -87,7 +112,7 @@ class BraxEnv(ValueIdentity, environment.Environment):
         info = {"metrics": brax.metrics}
         return self._observe(brax), evolved, reward, self.is_terminated(evolved, params), info
 
-    def _observe(self, brax: Any) -> jax.Array:
+    def _observe(self, brax: BraxStateLike) -> jax.Array:
         observation = brax.obs
         if self._observation_key is not None:
             observation = observation[self._observation_key]
@@ -121,7 +146,7 @@ class BraxEnv(ValueIdentity, environment.Environment):
 
 
 def from_brax(
-    env: Any,
+    env: BraxLike,
     *,
     max_steps_in_episode: int | None = None,
     observation_key: str | None = None,
@@ -165,7 +190,7 @@ def from_brax(
     return BraxEnv(env, BraxParams(int(length)), observation_key, indices)
 
 
-def _truncation(brax: Any) -> jax.Array:
+def _truncation(brax: BraxStateLike) -> jax.Array:
     """bool []: what an EpisodeWrapper notes; False without one."""
     return jnp.asarray(brax.info.get("truncation", False)).astype(bool)
 
@@ -185,7 +210,7 @@ def _load(name: str) -> tuple[Any, int]:
     return registry.load(name, config_overrides=overrides), int(config.episode_length)
 
 
-def _first_state(env: Any, name: str) -> Any:
+def _first_state(env: BraxLike, name: str) -> BraxStateLike:
     """Shapes of the State of reset."""
     key = jax.eval_shape(lambda: jax.random.key_data(jax.random.key(0)))
     try:
@@ -210,7 +235,7 @@ def _first_state(env: Any, name: str) -> Any:
     return state
 
 
-def _observation(name: str, state: Any, key: str | None) -> tuple[str | None, int]:
+def _observation(name: str, state: BraxStateLike, key: str | None) -> tuple[str | None, int]:
     """The key of the observation to be seen, if there are several, and its size."""
     observation = state.obs
     if isinstance(observation, dict) or hasattr(observation, "keys"):

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from gymnax.environments import spaces
+from jax.typing import ArrayLike
 
 from rtd3jax.envs.builtin import DISTURBANCES
 from rtd3jax.envs.entry import parameters_of
@@ -25,6 +26,7 @@ from rtd3jax.envs.interface import (
 )
 from rtd3jax.envs.registry import make
 from rtd3jax.errors import UserError
+from rtd3jax.protocols import EnvironmentLike
 
 NAMESPACE = "rtd3jax"
 
@@ -75,7 +77,7 @@ class GymnasiumEnv(gymnasium.Env):
         observation, self._state = _reset(self.world, self.params, self._key)
         return self._observation(observation), {}
 
-    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: ArrayLike) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One step of the episode; gymnasium.error.ResetNeeded after its end."""
         _check_process()
         if self._over:
@@ -154,7 +156,7 @@ def register_with_gymnasium() -> None:
                 )
 
 
-def _spaces(env: Any, params: Any) -> tuple[gymnasium.Space, gymnasium.Space]:
+def _spaces(env: EnvironmentLike, params: object) -> tuple[gymnasium.Space, gymnasium.Space]:
     """Spaces of actions and observations; UserError for what is no gymnax >= 1.0 environment."""
     name = environment_name(env)
     with foreign_code():
@@ -168,9 +170,10 @@ def _spaces(env: Any, params: Any) -> tuple[gymnasium.Space, gymnasium.Space]:
             "concatenate its parts into one array"
         )
     check_final_observation(name, after[-1], observation)
+    declaring: Any = env
     try:
         with foreign_code():
-            seen = _gymnasium_space(name, "observation", env.observation_space(params))
+            seen = _gymnasium_space(name, "observation", declaring.observation_space(params))
     except (AttributeError, NotImplementedError):
         seen = gymnasium.spaces.Box(-np.inf, np.inf, observation.shape, np.float32)
     if seen.shape != observation.shape:
@@ -181,7 +184,7 @@ def _spaces(env: Any, params: Any) -> tuple[gymnasium.Space, gymnasium.Space]:
     return actions, seen
 
 
-def _gymnasium_space(name: str, what: str, space: Any) -> gymnasium.Space:
+def _gymnasium_space(name: str, what: str, space: object) -> gymnasium.Space:
     if isinstance(space, spaces.Discrete):
         return gymnasium.spaces.Discrete(int(space.n))
     if not isinstance(space, spaces.Box):
@@ -197,14 +200,19 @@ def _gymnasium_space(name: str, what: str, space: Any) -> gymnasium.Space:
 
 
 @functools.partial(jax.jit, static_argnames="env")
-def _reset(env: Any, params: Any, key: jax.Array) -> tuple[jax.Array, Any]:
+def _reset(env: EnvironmentLike, params: object, key: jax.Array) -> tuple[jax.Array, Any]:
     with foreign_code():
         return env.reset(jax.random.key(key), params)
 
 
 @functools.partial(jax.jit, static_argnames="env")
 def _step(
-    env: Any, params: Any, key: jax.Array, time: jax.Array, state: Any, action: jax.Array
+    env: EnvironmentLike,
+    params: object,
+    key: jax.Array,
+    time: jax.Array,
+    state: object,
+    action: jax.Array,
 ) -> tuple:
     """The six values, with the observation before any automatic reset."""
     # Apart from the key of reset, which draws from the episode's key itself.

@@ -3,6 +3,8 @@
 from typing import Any
 
 import gymnax
+import jax
+from jax.typing import ArrayLike
 
 from rtd3jax.envs.identity import ValueIdentity, strong, with_identity
 from rtd3jax.envs.interface import foreign_code
@@ -27,20 +29,22 @@ class _Preset(ValueIdentity):
         """gymnax's, with the parameters given to ``make``."""
         return self._preset_params
 
-    def step(self, key: Any, state: Any, action: Any, params: Any = None) -> tuple:
+    def step(
+        self, key: jax.Array, state: object, action: ArrayLike, params: object = None
+    ) -> tuple:
         """Step as gymnax does, with a strong state."""
         with foreign_code():
             observation, state, *rest = super().step(key, state, action, params)
         return (observation, strong(state), *rest)
 
-    def reset(self, key: Any, params: Any = None) -> tuple:
+    def reset(self, key: jax.Array, params: object = None) -> tuple:
         """Reset as gymnax does, with a strong state."""
         with foreign_code():
             observation, state = super().reset(key, params)
         return observation, strong(state)
 
 
-def make_gymnax(env_id: str, params: Any = None) -> Any:
+def make_gymnax(env_id: str, params: object = None) -> Any:
     """gymnax's environment with ``params`` for its defaults; None means gymnax's own."""
     try:
         base, defaults = gymnax.make(env_id)

@@ -11,7 +11,7 @@ and the first observation never carries one (sin 0 = 0): the state is known from
 elements' differences keep the estimate true, so the wave's own parameters need not be inferred.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +31,7 @@ from rtd3jax.envs.processes.disturbances import (
 )
 from rtd3jax.envs.processes.process import Nothing, Process
 from rtd3jax.errors import UserError
+from rtd3jax.protocols import EnvironmentLike
 
 ANGLES, SPEEDS = 200, 160
 """Grid intervals of the values under noise; twice as many where the state becomes known."""
@@ -119,7 +120,7 @@ class FilterPolicy:
         return torques[jnp.argmax(jax.vmap(worth)(torques))]
 
 
-def filter_policy(env: Any) -> FilterPolicy:
+def filter_policy(env: EnvironmentLike) -> FilterPolicy:
     """The model-based reference of a pendulum under ``env``'s disturbance.
 
     It maximises the true state's reward, whichever reward ``env`` gives: that is what the tables

@@ -5,16 +5,15 @@ disturbed case from above. `rtd3jax.envs.pendulum.filter` has a policy that boun
 below.
 """
 
-from typing import Any
-
 from rtd3jax.envs.about import Ceiling
 from rtd3jax.envs.disturbed import Disturbed
 from rtd3jax.envs.pendulum.value_iteration import mean_optimal_return
 from rtd3jax.envs.processes.process import Nothing
 from rtd3jax.errors import UserError
+from rtd3jax.protocols import EnvironmentLike
 
 
-def best_return(env: Any, episodes: int = 0, seed: int = 0) -> Ceiling:
+def best_return(env: EnvironmentLike, episodes: int = 0, seed: int = 0) -> Ceiling:
     """The undisturbed optimum: no disturbed pendulum can do better by its true state's reward.
 
     It is an integral over all starts, which needs neither episodes nor a seed.

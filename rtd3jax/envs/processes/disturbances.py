@@ -4,12 +4,11 @@ They act on what the agent sees, never on the true state. Every draw is made onc
 unless a docstring says otherwise.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jax.typing import ArrayLike
 
 from rtd3jax.envs.processes.process import Process, float32, require, require_ordered
 from rtd3jax.errors import UserError
@@ -22,7 +21,7 @@ def element_mask(elements: tuple[int, ...], size: int) -> np.ndarray:
     return mask
 
 
-def check_elements(process: Any, elements: tuple[int, ...], size: int | None = None) -> None:
+def check_elements(process: object, elements: tuple[int, ...], size: int | None = None) -> None:
     """Raise UserError unless the elements are distinct indices of an observation of ``size``."""
     name = type(process).__name__
     if not elements or len(set(elements)) != len(elements) or min(elements) < 0:
@@ -31,7 +30,7 @@ def check_elements(process: Any, elements: tuple[int, ...], size: int | None = N
         raise UserError(f"{name}: element {max(elements)} is not in an observation of size {size}")
 
 
-def _between(key: jax.Array, low: Any, high: Any, shape: tuple[int, ...]) -> jax.Array:
+def _between(key: jax.Array, low: ArrayLike, high: ArrayLike, shape: tuple[int, ...]) -> jax.Array:
     """Uniform float32 draws between two parameters."""
     return jax.random.uniform(key, shape, jnp.float32, float32(low), float32(high))
 
@@ -241,7 +240,9 @@ class GaussianNoise(Process):
         """No state: the noise is white."""
         return ()
 
-    def step(self, key: jax.Array, state: Any, signal: jax.Array) -> tuple[jax.Array, Any]:
+    def step(
+        self, key: jax.Array, state: tuple[()], signal: jax.Array
+    ) -> tuple[jax.Array, tuple[()]]:
         """Add the noise."""
         noise = jax.random.normal(key, signal.shape, jnp.float32)
         return signal + float32(self.sigma) * noise, state
@@ -260,7 +261,9 @@ class Hidden(Process):
         """No state."""
         return ()
 
-    def step(self, key: jax.Array, state: Any, signal: jax.Array) -> tuple[jax.Array, Any]:
+    def step(
+        self, key: jax.Array, state: tuple[()], signal: jax.Array
+    ) -> tuple[jax.Array, tuple[()]]:
         """Remove the element: [O] -> [O-1]."""
         return jnp.concatenate([signal[: self.element], signal[self.element + 1 :]]), state
 

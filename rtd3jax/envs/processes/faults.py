@@ -81,7 +81,9 @@ class Quantisation(Process):
         """No state."""
         return ()
 
-    def step(self, key: jax.Array, state: Any, signal: jax.Array) -> tuple[jax.Array, Any]:
+    def step(
+        self, key: jax.Array, state: tuple[()], signal: jax.Array
+    ) -> tuple[jax.Array, tuple[()]]:
         """Round."""
         resolution = jnp.broadcast_to(float32(self.resolution), signal.shape)
         return resolution * jnp.round(signal / resolution), state

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jax.typing import ArrayLike
 
 from rtd3jax.errors import UserError
 
@@ -40,7 +41,9 @@ class Nothing(Process):
         """No state."""
         return ()
 
-    def step(self, key: jax.Array, state: Any, signal: jax.Array) -> tuple[jax.Array, Any]:
+    def step(
+        self, key: jax.Array, state: tuple[()], signal: jax.Array
+    ) -> tuple[jax.Array, tuple[()]]:
         """The signal and the empty state, unchanged."""
         return signal, state
 
@@ -119,13 +122,13 @@ class Sum(Process):
             process.validate()
 
 
-def float32(value: Any) -> jax.Array:
+def float32(value: ArrayLike) -> jax.Array:
     """A parameter as a strong float32 array, whatever kind of number it was given as."""
     return jnp.asarray(value, jnp.float32)
 
 
 def require(
-    process: Any, name: str, low: float = -np.inf, high: float = np.inf, above: float = -np.inf
+    process: object, name: str, low: float = -np.inf, high: float = np.inf, above: float = -np.inf
 ) -> None:
     """Raise UserError unless field ``name`` is finite, in [low, high] and greater than ``above``.
 
@@ -149,7 +152,7 @@ def require(
         raise UserError(f"{where} must be at most {high:g}")
 
 
-def require_ordered(process: Any, low_name: str, high_name: str) -> None:
+def require_ordered(process: object, low_name: str, high_name: str) -> None:
     """Raise UserError if field ``low_name`` exceeds field ``high_name``."""
     low, high = getattr(process, low_name), getattr(process, high_name)
     if isinstance(low, jax.core.Tracer) or isinstance(high, jax.core.Tracer):

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 from gymnax.environments import environment, spaces
+from jax.typing import ArrayLike
 
 from rtd3jax.envs.identity import ValueIdentity, strong
 from rtd3jax.envs.processes.process import Nothing, Process, float32
@@ -70,7 +71,7 @@ class Rover(ValueIdentity, environment.Environment):
         return _errors(state, params), strong(state)
 
     def step_env(
-        self, key: jax.Array, state: RoverState, action: Any, params: RoverParams
+        self, key: jax.Array, state: RoverState, action: ArrayLike, params: RoverParams
     ) -> tuple[jax.Array, RoverState, jax.Array, jax.Array, dict[Any, Any]]:
         """Command ``action`` [2]; the reward [] is that of the motion it produced."""
         limit = _limits(params)

@@ -5,7 +5,7 @@ the observation give the realised slip exactly; the best command then minimises 
 error under the conditional moments of the next slip.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ from rtd3jax.envs.processes.process import Nothing, Process
 from rtd3jax.envs.rover.environment import Rover, RoverParams
 from rtd3jax.envs.rover.slip import WHEELS, Ar1Slip, SineSlip
 from rtd3jax.errors import UserError
+from rtd3jax.protocols import EnvironmentLike
 
 
 class BayesState(NamedTuple):
@@ -58,7 +59,7 @@ class BayesPolicy:
         return action, BayesState(nominal, slip, state.time + jnp.int32(1))
 
 
-def bayes_policy(env: Any, model: Process | None = None) -> BayesPolicy:
+def bayes_policy(env: EnvironmentLike, model: Process | None = None) -> BayesPolicy:
     """The best policy of a rover whose slip follows ``model``.
 
     Args:
@@ -81,7 +82,7 @@ def bayes_policy(env: Any, model: Process | None = None) -> BayesPolicy:
     return BayesPolicy(params, model)
 
 
-def best_return(env: Any, episodes: int, seed: int) -> Ceiling | BayesPolicy:
+def best_return(env: EnvironmentLike, episodes: int, seed: int) -> Ceiling | BayesPolicy:
     """The best policy of a rover, whose return is its ceiling; under the sine slip, a bound.
 
     Args:

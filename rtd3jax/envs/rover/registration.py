@@ -9,9 +9,10 @@ from rtd3jax.envs.registry import register
 from rtd3jax.envs.rover.environment import Rover, RoverState
 from rtd3jax.envs.rover.optimum import best_return
 from rtd3jax.envs.rover.slip import Ar1Slip, SineSlip
+from rtd3jax.protocols import EnvironmentLike
 
 
-def constant_command(env: Any) -> tuple[Any, Any]:
+def constant_command(env: EnvironmentLike) -> tuple[Any, Any]:
     """The target itself, which a rover without slip would hold; ``env`` may have faults."""
     params = env.default_params
     params = getattr(params, "env", params)

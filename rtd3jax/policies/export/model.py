@@ -22,6 +22,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.typing import ArrayLike
 
 from rtd3jax.agents.memory.base import Params
 from rtd3jax.agents.networks import Linear, Network
@@ -99,7 +100,11 @@ class Model:
 
 
 def fold(
-    actor: Mapping[str, Any], cell: str | None, low: Any, high: Any, centre_token: Any
+    actor: Mapping[str, Any],
+    cell: str | None,
+    low: ArrayLike,
+    high: ArrayLike,
+    centre_token: ArrayLike,
 ) -> dict[str, np.ndarray]:
     """An actor's parameters as float32 arrays: an LSTM's biases merged, its gates as in `GATES`.
 

@@ -5,6 +5,7 @@ Plain operators of opset 17, so that old runtimes play it too.
 
 import json
 from collections.abc import Callable, Sequence
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -61,13 +62,13 @@ def onnx_bytes(model: Model) -> bytes:
 class _Graph:
     """Nodes in the order in which they were added, and the constants that they use."""
 
-    def __init__(self, helper: Any, arrays: dict[str, np.ndarray]):
+    def __init__(self, helper: ModuleType, arrays: dict[str, np.ndarray]):
         self._helper = helper
         self._arrays = arrays
         self.nodes: list[Any] = []
         self.constants: dict[str, np.ndarray] = {}
 
-    def add(self, operator: str, inputs: Sequence[str], *outputs: str, **attributes: Any) -> str:
+    def add(self, operator: str, inputs: Sequence[str], *outputs: str, **attributes: object) -> str:
         """Add a node; the name of its first output."""
         names = outputs or (f"{operator.lower()}_{len(self.nodes)}",)
         self.nodes.append(self._helper.make_node(operator, inputs, names, **attributes))

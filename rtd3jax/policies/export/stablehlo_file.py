@@ -12,6 +12,7 @@ import jax
 import jax.export
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from rtd3jax.agents.memory.base import Params
 from rtd3jax.errors import UserError, first_line
@@ -158,7 +159,7 @@ class StableHlo:
             for name, shape in self.about["state"].items()
         }
 
-    def step(self, state: State, observation: Any) -> tuple[jax.Array, State]:
+    def step(self, state: State, observation: ArrayLike) -> tuple[jax.Array, State]:
         """Actions [B, *action_shape] for float32 observations [B, O], and the state after them.
 
         Raises:

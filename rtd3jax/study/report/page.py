@@ -115,7 +115,7 @@ def render(data: dict[str, Any]) -> str:
     return "".join(pieces[part] if index % 2 else part for index, part in enumerate(found))
 
 
-def _json_in_html(data: Any) -> str:
+def _json_in_html(data: object) -> str:
     """JSON in which no character can end a script element."""
     text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     for character in "<>&\u2028\u2029":

@@ -27,6 +27,7 @@ from rtd3jax.envs.processes.process import Chain
 from rtd3jax.envs.registry import about_of
 from rtd3jax.errors import UserError, first_line
 from rtd3jax.policies.fit import check_fit
+from rtd3jax.protocols import EnvironmentLike, PolicyLike
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.report.data import rows_of
 from rtd3jax.study.results import number
@@ -80,8 +81,8 @@ def recordings(
 
 
 def record_episodes(
-    policy: Any,
-    env: Any,
+    policy: PolicyLike,
+    env: EnvironmentLike,
     episodes: int,
     seed: int,
     steps: int,
@@ -163,7 +164,7 @@ def _recorded(
     }
 
 
-def _scene(env: Any, drawing: Drawing, sizes: dict[str, int]) -> dict[str, Any]:
+def _scene(env: EnvironmentLike, drawing: Drawing, sizes: dict[str, int]) -> dict[str, Any]:
     """What the page has to know: kind of scene, names of elements, and constants.
 
     Args:
