@@ -5,23 +5,27 @@ from rtd3jax.agents.learners import register_learner
 from rtd3jax.agents.memory import Memory, register_memory
 from rtd3jax.agents.networks import NetworkSpec
 from rtd3jax.agents.variants import ALGORITHMS, Variant, register_agent
-from rtd3jax.ceilings import Ceiling, bayes_policy, ceiling
 from rtd3jax.config import Config
-from rtd3jax.deploy.stablehlo_file import load_stablehlo
-from rtd3jax.envs.brax_env import from_brax
+from rtd3jax.envs.about import Ceiling, Drawing
+from rtd3jax.envs.builtin import DISTURBANCES, ENVIRONMENTS
 from rtd3jax.envs.check import Finding, check_env, find_problems
-from rtd3jax.envs.disturbances import DampedSine, GaussianNoise, Hidden, Pulses, Sine
+from rtd3jax.envs.compat.brax import from_brax
+from rtd3jax.envs.compat.gymnasium import register_with_gymnasium, to_gymnasium
 from rtd3jax.envs.disturbed import disturb
-from rtd3jax.envs.faults import Delay, Dropout, GainDrift, OrnsteinUhlenbeck, Quantisation
-from rtd3jax.envs.gymnasium_env import register_with_gymnasium, to_gymnasium
-from rtd3jax.envs.process import Chain, Nothing, Process, Sum
-from rtd3jax.envs.registry import DISTURBANCES, ENVIRONMENTS, make, register
+from rtd3jax.envs.pendulum.filter import filter_policy
+from rtd3jax.envs.processes.disturbances import DampedSine, GaussianNoise, Hidden, Pulses, Sine
+from rtd3jax.envs.processes.faults import Delay, Dropout, GainDrift, OrnsteinUhlenbeck, Quantisation
+from rtd3jax.envs.processes.process import Chain, Nothing, Process, Sum
+from rtd3jax.envs.registry import make, register
+from rtd3jax.envs.rover.optimum import bayes_policy
 from rtd3jax.errors import UserError
-from rtd3jax.evaluate import evaluate
-from rtd3jax.load import load_policy
-from rtd3jax.pendulum_filter import filter_policy
-from rtd3jax.play_gymnasium import run_in_gymnasium
-from rtd3jax.policy import Policy, constant_policy, random_policy
+from rtd3jax.evaluation.ceiling import ceiling
+from rtd3jax.evaluation.gymnasium import run_in_gymnasium
+from rtd3jax.evaluation.rollout import evaluate
+from rtd3jax.policies.baselines import constant_policy, random_policy
+from rtd3jax.policies.export.stablehlo_file import load_stablehlo
+from rtd3jax.policies.load import load_policy
+from rtd3jax.policies.trained import Policy
 from rtd3jax.study.plan import Cell
 from rtd3jax.training.run import Failure, Run, train
 
@@ -36,6 +40,7 @@ __all__ = [
     "Config",
     "DampedSine",
     "Delay",
+    "Drawing",
     "Dropout",
     "Failure",
     "Finding",

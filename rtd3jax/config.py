@@ -21,7 +21,7 @@ DEFAULT_HISTORY_LENGTH = 10
 DEFAULT_SEGMENT_LENGTH = 10
 
 
-def _field(default: Any, help: str, *, traced: bool = False, low: float, high: float = math.inf):
+def _field(default: object, help: str, *, traced: bool = False, low: float, high: float = math.inf):
     """A configuration field. Lanes of one program may differ in those that are ``traced``.
 
     ``low`` and ``high`` are the inclusive bounds of the values that make sense.

@@ -4,12 +4,12 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from rtd3jax.deploy.formats import FORMATS
-from rtd3jax.files import user_path
-from rtd3jax.load import load_policy
-from rtd3jax.policy import Policy
+from rtd3jax.policies.export.formats import FORMATS
+from rtd3jax.policies.load import load_policy
+from rtd3jax.policies.trained import Policy
 from rtd3jax.registries import AGENTS
 from rtd3jax.study.command import exit_status, import_worlds, run_parser
+from rtd3jax.system.files import user_path
 
 POLICY = "policy"
 """The form that `rtd3jax.load_policy` reads."""

@@ -7,10 +7,10 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from rtd3jax.files import user_path
 from rtd3jax.study.command import exit_status, import_worlds, run_parser
 from rtd3jax.study.report.page import NAME, write_page
 from rtd3jax.study.rundir import RunDirectory
+from rtd3jax.system.files import user_path
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

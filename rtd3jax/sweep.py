@@ -63,7 +63,7 @@ class _Terminated(KeyboardInterrupt):
     """SIGTERM: lanes write their checkpoints, as after Ctrl-C."""
 
 
-def _terminate(*_: Any) -> None:
+def _terminate(*_: object) -> None:
     raise _Terminated
 
 

@@ -8,7 +8,7 @@ from rtd3jax.agents.agent import make_part
 from rtd3jax.agents.bounds import Bounds
 from rtd3jax.agents.networks import init_network
 from rtd3jax.envs.interface import describe
-from rtd3jax.policy import Policy
+from rtd3jax.policies.trained import Policy
 from rtd3jax.registries import AGENTS
 
 LENGTH = 3

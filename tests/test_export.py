@@ -81,8 +81,8 @@ def test_a_lane_file_alone_is_refused_with_the_way(run):
 
 
 def test_a_lane_of_a_world_that_is_not_registered_is_loaded_and_exported(tmp_path, monkeypatch):
-    for name in ("_registered", "_registrants"):
-        monkeypatch.setattr(registry, name, {})
+    known = dict(registry._entries)
+    monkeypatch.setattr(registry, "_entries", dict(registry._entries))
     rtd.register("robot", rtd.make("pendulum"), replace=True)
     cell = _cell("robot", "dropout")
     policy = random_policy("h-td3", cell.make_env())
@@ -90,7 +90,7 @@ def test_a_lane_of_a_world_that_is_not_registered_is_loaded_and_exported(tmp_pat
     directory.write_lane(cell, 0, policy.actor, CURVES, {}, None, policy.interface())
     directory.write_lane(cell, 1, policy.actor, CURVES, {}, None)  # as older versions did
     old = rtd.load_policy(tmp_path / "run", seed=1)
-    monkeypatch.setattr(registry, "_registered", {})
+    monkeypatch.setattr(registry, "_entries", known)
     loaded = rtd.load_policy(tmp_path / "run")
     for other in (old, loaded):
         assert other.interface() == policy.interface()

@@ -14,8 +14,8 @@ import pandas as pd
 import pytest
 
 import rtd3jax as rtd
-from rtd3jax.files import read_arrays
 from rtd3jax.study.rundir import RunDirectory
+from rtd3jax.system.files import read_arrays
 
 GOLDEN = pathlib.Path(__file__).parent / "golden"
 EXPECTED = np.load(GOLDEN / "actions.npz")

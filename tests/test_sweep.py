@@ -259,7 +259,7 @@ def test_a_cell_that_raises_does_not_stop_the_others(tmp_path, monkeypatch, caps
 def test_a_full_disk_is_one_line_and_loses_nothing(tmp_path, monkeypatch, capsys):
     import errno
 
-    from rtd3jax import files
+    from rtd3jax.system import files
 
     real, written = files.os.fsync, []
 
@@ -281,7 +281,7 @@ def test_a_full_disk_is_one_line_and_loses_nothing(tmp_path, monkeypatch, capsys
 
 def test_a_module_that_registers_worlds_can_be_imported(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(registry, "_registered", {})
+    monkeypatch.setattr(registry, "_entries", dict(registry._entries))
     (tmp_path / "own_worlds.py").write_text(
         "import rtd3jax as rtd\nrtd.register('own', rtd.make('rover'))\n"
     )

@@ -72,8 +72,9 @@ def one_step_chunks(monkeypatch):
 # A process that dies, as from SIGKILL, when it is about to move the file of this name.
 DYING = """
 import os, signal, sys
-from rtd3jax import files, sweep
+from rtd3jax import sweep
 from rtd3jax.study import references
+from rtd3jax.system import files
 from rtd3jax.training import lanes
 
 references.EPISODES = 2

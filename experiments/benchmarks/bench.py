@@ -40,7 +40,7 @@ from experiments.benchmarks.torch_processes import (
 )
 from rtd3jax.envs.interface import foreign_code
 from rtd3jax.errors import UserError
-from rtd3jax.files import write_bytes_atomically
+from rtd3jax.system.files import write_bytes_atomically
 from rtd3jax.training.lanes import workers
 
 RESULTS = pathlib.Path(__file__).parents[1] / "results" / "benchmarks"

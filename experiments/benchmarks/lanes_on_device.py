@@ -19,7 +19,7 @@ import jax
 import rtd3jax as rtd
 from experiments.benchmarks.ours import Lanes, make_config
 from rtd3jax.errors import UserError
-from rtd3jax.files import write_bytes_atomically
+from rtd3jax.system.files import write_bytes_atomically
 
 
 def columns(options: argparse.Namespace) -> dict[str, tuple[list[rtd.Config], int | None]]:

@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from experiments.benchmarks.ours import make_config
 from experiments.benchmarks.torch_processes import ONE_PROCESS, PROCESS_PER_CORE
 from rtd3jax.agents.variants import ALGORITHMS
-from rtd3jax.files import write_bytes_atomically
 from rtd3jax.study.colours import colour_of
 from rtd3jax.study.plan import update_flops
+from rtd3jax.system.files import write_bytes_atomically
 
 COLUMNS = ["agent", "history_length", "measurement", "repeat", "value", "machine"]
 ONE_STREAM = "lstm-td3-1ha1hc"

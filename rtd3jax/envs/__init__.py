@@ -1,1 +1,3 @@
-"""The world: environments, and the hidden processes that disturb them."""
+"""Environments, and the hidden processes that disturb them."""
+
+import rtd3jax.envs.builtin  # noqa: F401  (registers ours)

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import (
@@ -20,6 +21,7 @@ from rtd3jax.envs.interface import (
     survey,
 )
 from rtd3jax.errors import UserError
+from rtd3jax.protocols import EnvironmentLike
 
 EPISODES = 8
 LONGEST_EPISODE = 1_000
@@ -52,7 +54,7 @@ class Finding:
         return f"{self.problem}; {self.remedy}" if self.remedy else self.problem
 
 
-def check_env(env: Any, *, params: Any = None, seed: int = 0) -> None:
+def check_env(env: EnvironmentLike, *, params: object = None, seed: int = 0) -> None:
     """Play ``env`` with random actions, and raise if anything is wrong with it.
 
     Eight episodes are played to their end, for at most 1,000 steps; the environment is compiled for
@@ -83,7 +85,7 @@ def check_env(env: Any, *, params: Any = None, seed: int = 0) -> None:
         )
 
 
-def find_problems(env: Any, *, params: Any = None, seed: int = 0) -> list[Finding]:
+def find_problems(env: EnvironmentLike, *, params: object = None, seed: int = 0) -> list[Finding]:
     """What `check_env` would raise, as a list; empty for a sound environment."""
     try:
         params = parameters_of(env, params)
@@ -125,11 +127,12 @@ def _dtypes(found: Survey) -> Iterator[Finding]:
                 yield Finding("dtype", problem, remedy)
 
 
-def _spaces(env: Any, params: Any, found: Survey) -> Iterator[Finding]:
+def _spaces(env: EnvironmentLike, params: object, found: Survey) -> Iterator[Finding]:
     """Shapes that disagree with the space that the environment declares."""
     assert found.reset is not None
+    declaring: Any = env
     try:
-        space = env.observation_space(params)
+        space = declaring.observation_space(params)
     except Exception:  # declaring none is allowed
         return
     shape = tuple(getattr(space, "shape", None) or ())
@@ -141,7 +144,9 @@ def _spaces(env: Any, params: Any, found: Survey) -> Iterator[Finding]:
         )
 
 
-def _played(env: Any, params: Any, interface: Interface, seed: int) -> Iterator[Finding]:
+def _played(
+    env: EnvironmentLike, params: object, interface: Interface, seed: int
+) -> Iterator[Finding]:
     """What shows only when it runs."""
     limit = getattr(params, "max_steps_in_episode", None)
     steps = int(min(LONGEST_EPISODE, DEFAULT_STEP_LIMIT if limit is None else limit))
@@ -198,8 +203,10 @@ class _Record:
         return (self.terminated | self.truncated).any(1)
 
 
-def _episodes(env: Any, params: Any, interface: Interface, seed: int, steps: int) -> _Record:
-    def episode(key: jax.Array, keys: jax.Array, actions: jax.Array, params: Any) -> tuple:
+def _episodes(
+    env: EnvironmentLike, params: object, interface: Interface, seed: int, steps: int
+) -> _Record:
+    def episode(key: jax.Array, keys: jax.Array, actions: jax.Array, params: object) -> tuple:
         first, state = env.reset(key, params)
         actions = actions.reshape(steps, *interface.action_shape)
 
@@ -247,7 +254,7 @@ def _finite(record: _Record) -> Iterator[Finding]:
             yield Finding("finite", f"the {what} of step {step} is not finite", remedy)
 
 
-def _pure(env: Any, params: Any, record: _Record, seed: int) -> Iterator[Finding]:
+def _pure(env: EnvironmentLike, params: object, record: _Record, seed: int) -> Iterator[Finding]:
     """The same key and state that give another result."""
     state, action = _pick((record.last_state, record.last_action), 0)
 
@@ -273,10 +280,11 @@ def _pure(env: Any, params: Any, record: _Record, seed: int) -> Iterator[Finding
             return  # an automatic reset is within step
 
 
-def _time_limits(record: _Record, limit: Any, steps: int) -> Iterator[Finding]:
+def _time_limits(record: _Record, limit: int | None, steps: int) -> Iterator[Finding]:
     """A time limit that is reported as a termination, or not kept."""
-    known = limit is not None and int(limit) <= steps
-    at_limit = record.length == (int(limit) if known else record.length[0])
+    longest = steps + 1 if limit is None else int(limit)
+    known = longest <= steps
+    at_limit: np.ndarray = record.length == (longest if known else record.length[0])
     last = np.minimum(record.length, record.terminated.shape[1]) - 1
     terminated = record.terminated[np.arange(EPISODES), last]
     if record.ended.all() and at_limit.all() and terminated.all() and record.length[0] > 1:
@@ -286,10 +294,10 @@ def _time_limits(record: _Record, limit: Any, steps: int) -> Iterator[Finding]:
             "report it as truncated, not as terminated, or bootstrapping stops there: "
             "leave it to gymnax's is_truncated and params.max_steps_in_episode",
         )
-    elif known and (record.length > int(limit)).any():
+    elif known and (record.length > longest).any():
         yield Finding(
             "time-limit",
-            f"an episode goes on after params.max_steps_in_episode = {int(limit)} steps",
+            f"an episode goes on after params.max_steps_in_episode = {longest} steps",
             "count the steps in state.time, which gymnax's is_truncated reads",
         )
 
@@ -316,7 +324,7 @@ def _final_observations(record: _Record) -> Iterator[Finding]:
         )
 
 
-def _leaks(env: Any, params: Any, record: _Record, seed: int) -> Iterator[Finding]:
+def _leaks(env: EnvironmentLike, params: object, record: _Record, seed: int) -> Iterator[Finding]:
     """A new episode that depends on the one before it.
 
     Two different episodes end with the same key, so that the automatic reset gets the same random
@@ -326,11 +334,11 @@ def _leaks(env: Any, params: Any, record: _Record, seed: int) -> Iterator[Findin
     if len(pairs) < 2:
         return
 
-    def go_on(state: Any, action: jax.Array, params: Any) -> tuple:
+    def go_on(state: object, action: jax.Array, params: object) -> tuple:
         key = jax.random.key(seed)
         first, state, _, terminated, truncated, _ = env.step(key, state, action, params)
 
-        def step(state: Any, key: jax.Array) -> tuple:
+        def step(state: object, key: jax.Array) -> tuple:
             seen, state, reward, *_ = env.step(key, state, _pick(record.last_action, 0), params)
             return state, (seen, reward)
 
@@ -347,28 +355,28 @@ def _leaks(env: Any, params: Any, record: _Record, seed: int) -> Iterator[Findin
         )
 
 
-def _pick(tree: Any, index: int) -> Any:
+def _pick(tree: object, index: int) -> Any:
     return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
-def _close(one: Any, other: Any) -> bool:
+def _close(one: ArrayLike, other: ArrayLike) -> bool:
     return np.allclose(np.asarray(one), np.asarray(other), rtol=1e-5, atol=1e-6, equal_nan=True)
 
 
-def _equal(one: Any, other: Any) -> bool:
+def _equal(one: object, other: object) -> bool:
     """Whether two results are the same, as far as two compilations of one program can be.
 
     XLA may fuse a program in two ways, whose last digits differ. The tolerance is that of float32
     beside the largest number of an array; whole numbers and random keys have none. NaN equals NaN.
     """
 
-    def same(a: Any, b: Any) -> bool:
+    def same(a: jax.Array, b: jax.Array) -> bool:
         if jax.dtypes.issubdtype(a.dtype, jax.dtypes.prng_key):
             a, b = jax.random.key_data(a), jax.random.key_data(b)
         if not jnp.issubdtype(a.dtype, jnp.inexact):
             return np.array_equal(np.asarray(a), np.asarray(b))
-        a, b = (np.asarray(array).astype(np.float64) for array in (a, b))
-        size = np.max(np.abs(a), initial=0.0, where=np.isfinite(a))
-        return np.allclose(a, b, rtol=_DIGITS, atol=_DIGITS * size, equal_nan=True)
+        first, second = (np.asarray(array).astype(np.float64) for array in (a, b))
+        size = np.max(np.abs(first), initial=0.0, where=np.isfinite(first))
+        return np.allclose(first, second, rtol=_DIGITS, atol=_DIGITS * size, equal_nan=True)
 
     return all(map(same, jax.tree.leaves(one), jax.tree.leaves(other)))

@@ -6,12 +6,14 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 from gymnax.environments import environment, spaces
+from jax.typing import ArrayLike
 
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.identity import ValueIdentity, strong
 from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT, describe, foreign_code
-from rtd3jax.envs.process import Chain, Nothing, Process
+from rtd3jax.envs.processes.process import Chain, Nothing, Process
 from rtd3jax.errors import UserError, nearest
+from rtd3jax.protocols import ComposableEnvironment, EnvironmentLike
 
 REWARDS_FROM = ("state", "observation")
 CHANNELS = {"observation": "process", "action": "action", "reward": "reward"}
@@ -48,7 +50,7 @@ class DisturbedState(struct.PyTreeNode):
     """true state of the environment below"""
     process: Any
     """state of the observation's disturbance, reset with the episode"""
-    action: Any
+    action: ArrayLike
     """state of the action's, likewise"""
     reward: Any
     """state of the reward's, likewise"""
@@ -73,7 +75,7 @@ class Disturbed(ValueIdentity, environment.Environment):
 
     def __init__(
         self,
-        base: Any,
+        base: ComposableEnvironment,
         reward_from: str = "state",
         default_params: DisturbedParams | None = None,
     ) -> None:
@@ -88,7 +90,7 @@ class Disturbed(ValueIdentity, environment.Environment):
                 f"reward_from='observation' needs an environment with observed_reward, "
                 f"which {base.name} lacks"
             )
-        self.base = base
+        self.base: Any = base
         self.reward_from = reward_from
         self._default_params = default_params
 
@@ -144,7 +146,7 @@ class Disturbed(ValueIdentity, environment.Environment):
         self,
         key: jax.Array,
         state: DisturbedState,
-        action: Any,
+        action: ArrayLike,
         params: DisturbedParams,
     ) -> tuple[jax.Array, DisturbedState, jax.Array, jax.Array, dict[Any, Any]]:
         """One step of all; the observation [O] belongs to the episode even if it is its last."""
@@ -209,7 +211,9 @@ class Disturbed(ValueIdentity, environment.Environment):
         return spaces.Box(-jnp.inf, jnp.inf, (size,), jnp.float32)
 
 
-def disturb(env: Any, process: Process, channel: str = "observation", *, params: Any = None) -> Any:
+def disturb(
+    env: EnvironmentLike, process: Process, channel: str = "observation", *, params: object = None
+) -> Any:
     """``env`` with one channel passed through ``process``, which is drawn anew every episode.
 
     Call it again for further channels or processes: those of one channel act in the order in which
@@ -244,12 +248,17 @@ def disturb(env: Any, process: Process, channel: str = "observation", *, params:
                 f"{type(env).__name__} has no {method}, without which a disturbance cannot be "
                 "composed with its episodes: inherit from gymnax's Environment"
             )
-    if not isinstance(env, Disturbed):
+    base: Any = env
+    reward_from = "state"
+    if isinstance(env, Disturbed):
+        base, reward_from = env.base, env.reward_from
+    else:
         describe(env, params)
-        env, params = Disturbed(env), DisturbedParams(env=params)
+        params = DisturbedParams(env=params)
     field = CHANNELS[channel]
+    assert isinstance(params, DisturbedParams)
     params = params.replace(**{field: sequence(getattr(params, field), process)})
-    disturbed = Disturbed(env.base, env.reward_from, params)
+    disturbed = Disturbed(base, reward_from, params)
     check_fit(disturbed)
     return disturbed
 
@@ -277,14 +286,14 @@ def check_fit(env: Disturbed) -> None:
             )
 
 
-def _action_size(base: Any, params: Any) -> int:
+def _action_size(base: ComposableEnvironment, params: object) -> int:
     size = 1
     for length in base.action_space(params).shape:
         size *= length
     return size
 
 
-def _observation_size(base: Any, params: Any) -> int:
+def _observation_size(base: ComposableEnvironment, params: object) -> int:
     """Elements of the undisturbed observation; many environments declare no space."""
     with foreign_code():
         try:

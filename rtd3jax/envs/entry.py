@@ -5,12 +5,13 @@ from typing import Any
 import gymnasium
 
 from rtd3jax.errors import UserError
+from rtd3jax.protocols import EnvironmentLike
 
 METHODS = ("reset", "step", "action_space")
 """Without these nothing is a gymnax environment."""
 
 
-def parameters_of(env: Any, params: Any = None) -> Any:
+def parameters_of(env: EnvironmentLike, params: object = None) -> Any:
     """``params``, or the default parameters of ``env`` for None.
 
     Every function that takes an environment calls this first.
@@ -30,7 +31,7 @@ def parameters_of(env: Any, params: Any = None) -> Any:
         ) from error
 
 
-def check_gymnax(env: Any) -> None:
+def check_gymnax(env: object) -> None:
     """Raise UserError, with what to do instead, unless ``env`` looks like a gymnax environment."""
     if isinstance(env, str):
         raise UserError(

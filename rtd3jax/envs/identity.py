@@ -5,16 +5,17 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
 
-def strong(tree: Any) -> Any:
+def strong(tree: object) -> Any:
     """Return the tree with every leaf a strongly typed array of the dtype it already has.
 
     A Python number in a state is weakly typed, and what a step returns often is not. Loops then
     trace twice or refuse their carry.
     """
 
-    def convert(leaf: Any) -> jax.Array:
+    def convert(leaf: ArrayLike) -> jax.Array:
         array = jnp.asarray(leaf)
         return jax.lax.convert_element_type(array, array.dtype)
 
@@ -47,12 +48,14 @@ class ValueIdentity:
         """Hash of the type and the static options."""
         return hash(self._identity())
 
-    def step(self, key: jax.Array, state: Any, action: Any, params: Any = None) -> tuple:
+    def step(
+        self, key: jax.Array, state: object, action: ArrayLike, params: object = None
+    ) -> tuple:
         """One step with automatic reset; ``params`` None means this object's own defaults."""
         params = self.default_params if params is None else params  # type: ignore[attr-defined]
         return super().step(key, state, action, params)  # type: ignore[misc]
 
-    def reset(self, key: jax.Array, params: Any = None) -> tuple:
+    def reset(self, key: jax.Array, params: object = None) -> tuple:
         """Start an episode; ``params`` None means this object's own defaults."""
         params = self.default_params if params is None else params  # type: ignore[attr-defined]
         return super().reset(key, params)  # type: ignore[misc]

@@ -11,6 +11,7 @@ import numpy as np
 
 from rtd3jax.envs.entry import check_gymnax
 from rtd3jax.errors import UserError
+from rtd3jax.protocols import EnvironmentLike
 
 DEFAULT_STEP_LIMIT = 10_000
 """Steps after which an episode is cut where the environment names no time limit of its own."""
@@ -57,7 +58,7 @@ class Survey:
     """Shapes of the six values."""
 
 
-def describe(env: Any, params: Any) -> Interface:
+def describe(env: EnvironmentLike, params: object) -> Interface:
     """Check that ``env`` is a gymnax >= 1.0 environment that can be learned, and measure it.
 
     The environment is traced, not compiled. Whatever is wrong is a UserError with the remedy.
@@ -69,7 +70,7 @@ def describe(env: Any, params: Any) -> Interface:
     return found.interface
 
 
-def survey(env: Any, params: Any) -> Survey:
+def survey(env: EnvironmentLike, params: object) -> Survey:
     """All that `describe` can find wrong, and the shapes that it saw."""
     name = environment_name(env)
     try:
@@ -104,7 +105,7 @@ def survey(env: Any, params: Any) -> Survey:
     return Survey(Interface(size, shape, low.size, low, high), problems, first, after)
 
 
-def trace_reset(env: Any, params: Any) -> tuple[Any, Any]:
+def trace_reset(env: EnvironmentLike, params: object) -> tuple[Any, Any]:
     """Shapes of the two values of reset; UserError if it fails or gives others."""
     name, key = environment_name(env), jax.eval_shape(lambda: jax.random.key(0))
     with foreign_code():
@@ -114,7 +115,9 @@ def trace_reset(env: Any, params: Any) -> tuple[Any, Any]:
     return first
 
 
-def trace_step(env: Any, params: Any, state: Any, action: Any) -> tuple:
+def trace_step(
+    env: EnvironmentLike, params: object, state: object, action: jax.ShapeDtypeStruct
+) -> tuple:
     """Shapes of the six values of step; UserError if it fails or gives another number."""
     name, key = environment_name(env), jax.eval_shape(lambda: jax.random.key(0))
     with foreign_code():
@@ -133,7 +136,7 @@ def trace_step(env: Any, params: Any, state: Any, action: Any) -> tuple:
     return after
 
 
-def action_bounds(env: Any, params: Any) -> tuple[jax.Array, jax.Array]:
+def action_bounds(env: EnvironmentLike, params: object) -> tuple[jax.Array, jax.Array]:
     """Lowest and highest action, [A] each, flat; ``params`` may be traced."""
     with foreign_code():
         space = env.action_space(params)
@@ -144,10 +147,10 @@ def action_bounds(env: Any, params: Any) -> tuple[jax.Array, jax.Array]:
     return low, high
 
 
-def environment_name(env: Any) -> str:
+def environment_name(env: object) -> str:
     """The name used in messages."""
     try:
-        return str(env.name)
+        return str(getattr(env, "name", type(env).__name__))
     except Exception:  # a name is for messages only, so a broken one must not hide the message
         return type(env).__name__
 
@@ -164,7 +167,9 @@ def _attempt(name: str, what: str, call: Callable[[], Any]) -> Any:
         raise UserError(f"environment {name} failed in {what}: {reason}") from error
 
 
-def _bounds(env: Any, params: Any, name: str) -> tuple[tuple[int, ...], np.ndarray, np.ndarray]:
+def _bounds(
+    env: EnvironmentLike, params: object, name: str
+) -> tuple[tuple[int, ...], np.ndarray, np.ndarray]:
     """Shape of an action, and its bounds [A]."""
     space = _attempt(name, "action_space", lambda: env.action_space(params))
     if hasattr(space, "n"):
@@ -216,7 +221,9 @@ def _check_observation(name: str, what: str, observation: Any) -> None:
         )
 
 
-def _step_problems(name: str, after: tuple, first_observation: Any) -> Iterator[UserError]:
+def _step_problems(
+    name: str, after: tuple, first_observation: jax.ShapeDtypeStruct
+) -> Iterator[UserError]:
     """What is wrong with the six values of step."""
     observation, _, reward, terminated, truncated, info = after
     try:
@@ -241,7 +248,7 @@ def _step_problems(name: str, after: tuple, first_observation: Any) -> Iterator[
         yield error
 
 
-def check_final_observation(name: str, info: Any, observation: Any) -> None:
+def check_final_observation(name: str, info: object, observation: jax.ShapeDtypeStruct) -> None:
     """Raise UserError unless ``info`` has the observation before the automatic reset."""
     if not isinstance(info, dict) or "final_observation" not in info:
         raise UserError(

@@ -2,16 +2,18 @@
 
 import ast
 import dataclasses
+import functools
 import math
 import numbers
 import re
 import sys
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, cast
 
 import gymnax
 
-from rtd3jax.envs.disturbances import DampedSine, GaussianNoise, Hidden, Pulses, Sine
+from rtd3jax.envs.about import About, Drawing
+from rtd3jax.envs.compat.gymnax import make_gymnax
 from rtd3jax.envs.disturbed import (
     CHANNELS,
     Disturbed,
@@ -20,45 +22,18 @@ from rtd3jax.envs.disturbed import (
     disturb,
     sequence,
 )
-from rtd3jax.envs.entry import check_gymnax
-from rtd3jax.envs.faults import Delay, Dropout, GainDrift, OrnsteinUhlenbeck, Quantisation
-from rtd3jax.envs.identity import ValueIdentity, strong, with_identity
-from rtd3jax.envs.interface import foreign_code
-from rtd3jax.envs.pendulum import Pendulum
-from rtd3jax.envs.process import Nothing, Process, require
-from rtd3jax.envs.rover import Rover
-from rtd3jax.envs.slip import Ar1Slip, SineSlip
+from rtd3jax.envs.entry import check_gymnax, parameters_of
+from rtd3jax.envs.interface import describe
+from rtd3jax.envs.processes.faults import (
+    Delay,
+    Dropout,
+    GainDrift,
+    OrnsteinUhlenbeck,
+    Quantisation,
+)
+from rtd3jax.envs.processes.process import Nothing, Process, require
 from rtd3jax.errors import UserError, nearest
-
-_PROCESSES: dict[str, dict[str, Process]] = {
-    "pendulum": {
-        "none": Nothing(),
-        "temporal-bias": Pulses(),
-        "temporal-sine": Sine(
-            amplitude_min=1.0,
-            amplitude_max=1.0,
-            period_min=70.0,
-            period_max=70.0,
-            elements=(0, 1),
-        ),
-        "random-sine": Sine(),
-        "noise": GaussianNoise(),
-        "hidden": Hidden(),
-        "combined-sine": Sine(waves=2),
-        "damped-sine": DampedSine(),
-    },
-    "rover": {
-        "none": Nothing(),
-        "ar1-slip": Ar1Slip(),
-        "ar1-slip-high-variance": Ar1Slip(sigma=0.10),
-        "ar1-slip-fast": Ar1Slip(rho=0.90),
-        "ar1-slip-slow": Ar1Slip(rho=0.98),
-        "sine-slip": SineSlip(),
-    },
-}
-
-_OWN_CHANNEL = {"pendulum": "observation", "rover": "slip"}
-"""Where a world's own processes act."""
+from rtd3jax.protocols import EnvironmentLike
 
 _FAULTS: dict[str, tuple[str, Process]] = {
     "dropout": ("observation", Dropout()),
@@ -70,100 +45,213 @@ _FAULTS: dict[str, tuple[str, Process]] = {
 }
 
 FAULTS: tuple[str, ...] = tuple(_FAULTS)
-"""The disturbances that fit any world, a gymnax id included; not the paper's."""
+"""The disturbances that fit any environment, a gymnax id included; not the paper's."""
 
-ENVIRONMENTS: tuple[str, ...] = tuple(_PROCESSES)
-"""The paper's worlds. Every gymnax id can be made too."""
+NO_BASELINES = ("random", "ceiling", "upper bound")
+"""Names that a study gives to something else."""
 
-DISTURBANCES: dict[str, tuple[str, ...]] = {
-    env: (*ids, *_FAULTS) for env, ids in _PROCESSES.items()
-}
-"""The disturbances of each world: its own (paper, Sections 5.2 and 8.4), then ``FAULTS``. They can
-be joined by ``+``: ``ar1-slip+dropout``."""
 
-_constructors: dict[str, Callable[..., Any]] = {}
-_registered: dict[str, tuple[Any, dict[str, tuple[str, Process]]]] = {}
-_registrants: dict[str, str] = {}
-"""The module that registered each id: a notebook's cell that runs again may do it again."""
+@dataclasses.dataclass(frozen=True)
+class _Entry:
+    """What is registered under one id: an environment, or a function that makes it.
+
+    Attributes:
+        env: the environment without disturbances and with its own parameters.
+        construct: the function that sees to disturbances and parameters itself; None for ``env``.
+        disturbances: channel and process of each of the environment's own, by name.
+        registrant: the module that registered it: a notebook's cell that runs again may do it
+            again.
+        positive: parameters of the environment that must be greater than zero.
+        reward_from_observation: disturbances under which the reward is the observation's.
+        with_params: makes the environment with other default parameters.
+        about: baselines, ceiling and drawing.
+    """
+
+    env: EnvironmentLike | None
+    construct: Callable[..., Any] | None
+    disturbances: Mapping[str, tuple[str, Process]]
+    registrant: str
+    positive: tuple[str, ...] = ()
+    reward_from_observation: tuple[str, ...] = ()
+    with_params: Callable[[Any], Any] | None = None
+    about: About = About()
+
+
+_NONE: dict[str, tuple[str, Process]] = {"none": ("observation", Nothing())}
+_entries: dict[str, _Entry] = {}
 
 
 def make(env_id: str, disturbance: str = "none", **parameters: Any) -> Any:
     """Make an environment whose ``default_params`` carry the disturbance and the parameters.
 
-    ``disturbance`` is an id, or several joined by ``+``, of which those that disturb the same thing
-    act in that order. A parameter is a field of a disturbance, else of the environment's
-    parameters; the pendulum also has ``reward_from`` ("state" or "observation"; the default is
-    "observation" for ``noise`` alone, as the paper has it [choice]). ``env_id`` is one of
-    ``ENVIRONMENTS``, a registered id, or a gymnax id.
+    Args:
+        env_id: one of ``ENVIRONMENTS``, a registered id, or a gymnax id.
+        disturbance: an id, or several joined by ``+``. Those that disturb the same thing act in
+            that order.
+        **parameters: fields of a disturbance, else of the environment's parameters. An environment
+            with ``observed_reward`` also has ``reward_from`` ("state" or "observation"). Its
+            default is "state", but for ``noise`` of the pendulum, as the paper has it [choice].
+
+    Raises:
+        UserError: for an unknown id, disturbance or parameter, or a value that makes no sense.
     """
-    if env_id in _constructors:
-        return _constructors[env_id](disturbance, **parameters)
-    if env_id in _registered:
-        return _disturbed(env_id, _registered[env_id][0], disturbance, parameters)
-    if env_id in _PROCESSES or env_id in gymnax.registered_envs:
-        base = {"pendulum": Pendulum, "rover": Rover}.get(env_id, lambda: _make_gymnax(env_id))()
-        return _disturbed(env_id, base, disturbance, parameters)
-    known = (*ENVIRONMENTS, *_constructors, *_registered, *gymnax.registered_envs)
-    raise UserError(f"unknown environment {env_id!r}{nearest(env_id, known)}")
+    entry = _entries.get(env_id)
+    if entry is None and env_id in gymnax.registered_envs:
+        remake = functools.partial(make_gymnax, env_id)
+        entry = _Entry(make_gymnax(env_id), None, _NONE, "gymnax", with_params=remake)
+    if entry is None:
+        known = (*_entries, *gymnax.registered_envs)
+        raise UserError(f"unknown environment {env_id!r}{nearest(env_id, known)}")
+    if entry.construct is not None:
+        return entry.construct(disturbance, **parameters)
+    return _disturbed(env_id, entry, disturbance, parameters)
 
 
 def register(
     env_id: str,
-    world: Any,
-    disturbances: dict[str, Process | tuple[str, Process]] | None = None,
+    env: EnvironmentLike | Callable[..., Any],
+    disturbances: Mapping[str, Process | tuple[str, Process]] | None = None,
     *,
+    positive: Iterable[str] = (),
+    reward_from_observation: Iterable[str] = (),
+    baselines: Mapping[str, Callable[[Any], Any]] | None = None,
+    ceiling: Callable[[Any, int, int], Any] | None = None,
+    drawing: Drawing | None = None,
+    with_params: Callable[[Any], Any] | None = None,
+    try_disturbances: bool = True,
     replace: bool = False,
 ) -> None:
-    """Let ``make`` and the sweep know a world by name.
+    """Let ``make`` and the sweep know an environment by name. The package's own come this way too.
 
     Args:
         env_id: a new id, or one that the calling module itself registered, which is replaced: a
             notebook's cell may run again.
-        world: a gymnax >= 1.0 environment, to which ``make`` then gives parameters and disturbances
-            as it does to ours; or a function ``(disturbance, **parameters)`` that returns one and
-            sees to both itself.
+        env: a gymnax >= 1.0 environment, to which ``make`` then gives parameters and disturbances;
+            or a function ``(disturbance, **parameters)`` that returns one and sees to both itself.
+            The other arguments are for an environment, not for a function.
         disturbances: of an environment, beside "none" and ``FAULTS``: the name of each, and its
-            process of the observation or its (channel, process), as `disturb` takes them.
+            process of the observation or its (channel, process). A channel is one that `disturb`
+            takes, or the name of a parameter of the environment that holds a process and acts
+            within the dynamics.
+        positive: parameters of the environment that must be greater than zero.
+        reward_from_observation: names of disturbances under which the reward is computed from the
+            observation that the agent saw, by the environment's ``observed_reward``, unless
+            ``reward_from`` is given to ``make``.
+        baselines: policies that need no training, by name: see `rtd3jax.envs.about.About`.
+        ceiling: the best possible return, for `rtd3jax.ceiling` and a study: see there.
+        drawing: how the page of a study shows an episode.
+        with_params: makes the environment with other default parameters, such as its class. Where
+            it is given, ``make`` returns the environment itself if nothing outside its dynamics is
+            disturbed. Without it, ``make`` always composes it with its parameters.
+        try_disturbances: whether to trace the environment with each disturbance now.
         replace: what another module registered under this id. Ours and gymnax's stay.
 
     Raises:
-        UserError: for an id or a name that is taken, or what is no world.
+        UserError: for an id or a name that is taken, or what is no environment.
     """
     module = sys._getframe(1).f_globals.get("__name__", "")
     if not isinstance(env_id, str) or not env_id:
         raise UserError(f"an environment id must be a non-empty string, not {env_id!r}")
-    is_environment = callable(getattr(world, "reset", None)) and callable(
-        getattr(world, "step", None)
-    )
-    if isinstance(world, type) or not (is_environment or callable(world)):
-        raise UserError(f"the world {env_id!r} must be an environment or a function, not {world!r}")
-    if env_id in _PROCESSES or env_id in gymnax.registered_envs:
-        raise UserError(f"environment {env_id!r} exists already; choose another id")
-    if env_id in {*_constructors, *_registered} and not replace:
-        registrant = _registrants.get(env_id)
-        if registrant != module:
+    is_environment = callable(getattr(env, "reset", None)) and callable(getattr(env, "step", None))
+    if isinstance(env, type) or not (is_environment or callable(env)):
+        raise UserError(f"{env_id!r} must be an environment or a function, not {env!r}")
+    _check_free(env_id, module, replace)
+    about = About(dict(baselines or {}), ceiling, drawing)
+    extras = (tuple(positive), tuple(reward_from_observation), with_params, about)
+    if not is_environment:
+        if disturbances is not None or extras != ((), (), None, About()):
             raise UserError(
-                f"environment {env_id!r} exists already, registered by {registrant}; choose "
-                "another id, or give replace=True"
+                f"{env_id!r}: disturbances and what else is known of an environment are for an "
+                "environment, not for a function"
             )
-    if is_environment:
-        check_gymnax(world)
-        named = _named_processes(env_id, world, disturbances or {})
-        _constructors.pop(env_id, None)
-        _registered[env_id] = world, named
-    elif disturbances is not None:
-        raise UserError(f"{env_id!r}: disturbances are for an environment, not for a function")
-    else:
-        _registered.pop(env_id, None)
-        _constructors[env_id] = world
-    _registrants[env_id] = module
+        _entries[env_id] = _Entry(None, cast("Callable[..., Any]", env), {}, module)
+        return
+    check_gymnax(env)
+    env = cast("EnvironmentLike", env)
+    named = _named_processes(env_id, env, disturbances or {}, try_disturbances)
+    _check_extras(env_id, env, named, extras)
+    known = next((e.about for e in _entries.values() if e.env is not None and e.env == env), None)
+    if known is not None:
+        extras = (*extras[:3], about.or_else(known))
+    _entries[env_id] = _Entry(env, None, named, module, *extras)
+
+
+def about_of(env: EnvironmentLike, env_id: str | None = None) -> About:
+    """What was registered with ``env_id``; without it, with an environment that equals ``env``.
+
+    ``env`` may be disturbed. What nobody registered has neither baselines, ceiling nor drawing.
+    """
+    if env_id in _entries:
+        return _entries[env_id].about
+    base = env.base if isinstance(env, Disturbed) else env
+    known = (e.about for e in _entries.values() if e.env is not None and e.env == base)
+    return next(known, About())
+
+
+def disturbances_of(env_id: str) -> tuple[str, ...]:
+    """Names of the disturbances of a registered environment: its own, then ``FAULTS``."""
+    return (*_entries[env_id].disturbances, *_FAULTS)
+
+
+def _check_free(env_id: str, module: str, replace: bool) -> None:
+    """Raise UserError where ``module`` may not register ``env_id``."""
+    entry = _entries.get(env_id)
+    ours = entry is not None and entry.registrant.startswith(f"{_PACKAGE}.")
+    if ours or env_id in gymnax.registered_envs:
+        raise UserError(f"environment {env_id!r} exists already; choose another id")
+    if entry is not None and not replace and entry.registrant != module:
+        raise UserError(
+            f"environment {env_id!r} exists already, registered by {entry.registrant}; choose "
+            "another id, or give replace=True"
+        )
+
+
+_PACKAGE = __name__.partition(".")[0]
+
+
+def _check_extras(
+    env_id: str,
+    env: EnvironmentLike,
+    named: Mapping[str, tuple[str, Process]],
+    extras: tuple[tuple[str, ...], tuple[str, ...], Callable[[Any], Any] | None, About],
+) -> None:
+    """Raise UserError, naming the argument of `register`, for what the environment has not."""
+    positive, reward_from_observation, with_params, about = extras
+    params = parameters_of(env)
+    fields = list(_settable(params))
+    wanted = positive
+    if about.drawing is not None:
+        if not isinstance(about.drawing, Drawing):
+            raise UserError(f"{env_id!r}: drawing must be an rtd.Drawing, not {about.drawing!r}")
+        seconds = about.drawing.step_seconds
+        wanted += (*about.drawing.constants, *([] if seconds is None else [seconds]))
+    for name in wanted:
+        if name not in fields:
+            raise UserError(f"{env_id!r} has no parameter {name!r}{nearest(name, fields)}")
+    for name in reward_from_observation:
+        if name not in named:
+            raise UserError(f"{env_id!r} has no disturbance {name!r}{nearest(name, named)}")
+        if not hasattr(env, "observed_reward"):
+            raise UserError(f"{env_id!r}: a reward from the observation needs observed_reward")
+    functions: dict[str, Any] = {"ceiling": about.ceiling, "with_params": with_params}
+    functions = {name: value for name, value in functions.items() if value is not None}
+    functions |= {f"baseline {name!r}": value for name, value in about.baselines.items()}
+    for name, value in functions.items():
+        if not callable(value):
+            raise UserError(f"{env_id!r}: {name} must be a function, not {value!r}")
+    for name in about.baselines:
+        if not re.fullmatch(r"[\w.-]+", name) or name in NO_BASELINES:
+            raise UserError(
+                f"{env_id!r}: a baseline cannot be called {name!r}; choose another name of "
+                "letters, digits, '-', '.' and '_'"
+            )
 
 
 def _named_processes(
-    env_id: str, world: Any, disturbances: dict[str, Any]
+    env_id: str, env: EnvironmentLike, disturbances: Mapping[str, Any], tried: bool
 ) -> dict[str, tuple[str, Process]]:
-    """Channel and process of each name, each tried on the world."""
-    named: dict[str, tuple[str, Process]] = {"none": ("observation", Nothing())}
+    """Channel and process of each name, each ``tried`` on the environment."""
+    named = dict(_NONE)
     for name, value in disturbances.items():
         if not re.fullmatch(r"[\w.-]+", name) or name in (*named, *_FAULTS):
             raise UserError(
@@ -171,7 +259,16 @@ def _named_processes(
                 "letters, digits, '-', '.' and '_'"
             )
         channel, process = value if isinstance(value, tuple) else ("observation", value)
-        disturb(world, process, channel)
+        params = parameters_of(env)
+        if channel in CHANNELS or not isinstance(getattr(params, channel, None), Process):
+            if tried:
+                disturb(env, process, channel)
+        elif not isinstance(process, Process):
+            raise UserError(f"{env_id!r}: {name} needs a process, not {process!r}")
+        else:
+            process.validate()
+            if tried:
+                describe(env, params.replace(**{channel: process}))
         named[name] = channel, process
     return named
 
@@ -199,20 +296,9 @@ def parse_disturbance(text: str) -> tuple[str, dict[str, Any]]:
     return disturbance.strip(), parameters
 
 
-def _known(env_id: str) -> dict[str, tuple[str, Process]]:
-    """Channel and process of every disturbance of a world, by name."""
-    if env_id in _registered:
-        own = _registered[env_id][1]
-    else:
-        processes = _PROCESSES.get(env_id, {"none": Nothing()})
-        channel = _OWN_CHANNEL.get(env_id, "observation")
-        own = {name: (channel, process) for name, process in processes.items()}
-    return {**own, **_FAULTS}
-
-
-def _lookup(env_id: str, disturbance: str) -> list[tuple[str, Process]]:
+def _lookup(env_id: str, entry: _Entry, disturbance: str) -> list[tuple[str, Process]]:
     """Channel and process of each part of ``disturbance``."""
-    known = _known(env_id)
+    known = {**entry.disturbances, **_FAULTS}
     for name in disturbance.split("+"):
         if name not in known:
             raise UserError(
@@ -222,14 +308,17 @@ def _lookup(env_id: str, disturbance: str) -> list[tuple[str, Process]]:
     return [known[name] for name in disturbance.split("+")]
 
 
-def _disturbed(env_id: str, base: Any, disturbance: str, parameters: dict[str, Any]) -> Any:
-    """``base`` with the named disturbance, and ``parameters`` shared out among them."""
+def _disturbed(env_id: str, entry: _Entry, disturbance: str, parameters: dict[str, Any]) -> Any:
+    """The entry's environment, disturbed, with ``parameters`` shared out among them."""
+    base: Any = entry.env
     names = disturbance.split("+")
-    channels, processes = zip(*_lookup(env_id, disturbance), strict=True)
+    channels, processes = zip(*_lookup(env_id, entry, disturbance), strict=True)
     rest, reward_from = dict(parameters), "state"
     also: tuple[str, ...] = ()
-    if env_id == "pendulum":
-        reward_from = rest.pop("reward_from", "observation" if "noise" in names else "state")
+    if hasattr(base, "observed_reward"):
+        if set(names) & set(entry.reward_from_observation):
+            reward_from = "observation"
+        reward_from = rest.pop("reward_from", reward_from)
         also = ("reward_from",)
     what = f"{env_id} with {disturbance}"
     _check_owners(what, names, processes, rest)
@@ -237,7 +326,7 @@ def _disturbed(env_id: str, base: Any, disturbance: str, parameters: dict[str, A
     processes, params = assigned[:-1], assigned[-1]
     for process in processes:
         process.validate()
-    for name in _POSITIVE.get(env_id, ()):
+    for name in entry.positive:
         require(params, name, above=0)
     if hasattr(params, "max_steps_in_episode"):
         require(params, "max_steps_in_episode", low=1)
@@ -245,25 +334,16 @@ def _disturbed(env_id: str, base: Any, disturbance: str, parameters: dict[str, A
     def on(channel: str) -> Process:
         return sequence(*(p for p, c in zip(processes, channels, strict=True) if c == channel))
 
-    if env_id == "rover":
-        params = params.replace(slip=on("slip"))
-        base = Rover(params)
-    elif env_id in gymnax.registered_envs:
-        base = _make_gymnax(env_id, params)
-    bare = env_id == "rover" or env_id in gymnax.registered_envs
-    if bare and all(isinstance(on(channel), Nothing) for channel in CHANNELS):
-        return base
+    for channel in {channel for channel, _ in entry.disturbances.values()} - {*CHANNELS}:
+        params = params.replace(**{channel: on(channel)})
+    if entry.with_params is not None:
+        base = entry.with_params(params)
+        if all(isinstance(on(channel), Nothing) for channel in CHANNELS):
+            return base
     fields = {field: on(channel) for channel, field in CHANNELS.items()}
     env = Disturbed(base, reward_from, DisturbedParams(env=params, **fields))
     check_fit(env)
     return env
-
-
-_POSITIVE = {
-    "pendulum": ("max_speed", "max_torque", "dt", "m", "l"),
-    "rover": ("wheelbase", "max_speed", "max_yaw_rate"),
-}
-"""Parameters that must be greater than zero."""
 
 
 def _check_owners(
@@ -277,51 +357,6 @@ def _check_owners(
                 f"{what}: {name!r} could be that of {' or '.join(owners)}; "
                 "join such disturbances with rtd.disturb"
             )
-
-
-class _Preset(ValueIdentity):
-    """A gymnax environment whose ``default_params`` are given, and whose states are strong.
-
-    It is foreign code, which strict promotion would refuse.
-    """
-
-    _preset_id: str
-    _preset_params: Any
-
-    def identity(self) -> tuple:
-        """The id: gymnax never lets an id be made anew by another factory."""
-        return (self._preset_id,)
-
-    @property
-    def default_params(self) -> Any:
-        """gymnax's, with the parameters given to ``make``."""
-        return self._preset_params
-
-    def step(self, key: Any, state: Any, action: Any, params: Any = None) -> tuple:
-        """Step as gymnax does, with a strong state."""
-        with foreign_code():
-            observation, state, *rest = super().step(key, state, action, params)
-        return (observation, strong(state), *rest)
-
-    def reset(self, key: Any, params: Any = None) -> tuple:
-        """Reset as gymnax does, with a strong state."""
-        with foreign_code():
-            observation, state = super().reset(key, params)
-        return observation, strong(state)
-
-
-def _make_gymnax(env_id: str, params: Any = None) -> Any:
-    """gymnax's environment with ``params`` for its defaults; None means gymnax's own."""
-    try:
-        base, defaults = gymnax.make(env_id)
-    except Exception as error:
-        raise UserError(
-            f"environment {env_id} cannot be made: {type(error).__name__}: {error}"
-        ) from error
-    env: Any = object.__new__(with_identity(_Preset, type(base)))  # type: ignore[arg-type]
-    params = defaults if params is None else params
-    env.__dict__.update(vars(base), _preset_id=env_id, _preset_params=params)
-    return env
 
 
 def _assign(
@@ -350,7 +385,7 @@ def _assign(
     )
 
 
-def _settable(owner: Any) -> dict[str, Any]:
+def _settable(owner: object) -> dict[str, Any]:
     """The fields that a plain value can set, with their defaults."""
     if not dataclasses.is_dataclass(owner):  # others' parameters can be anything
         return {}
@@ -358,7 +393,7 @@ def _settable(owner: Any) -> dict[str, Any]:
     return {name: v for name, v in values.items() if isinstance(v, bool | int | float | tuple)}
 
 
-def _coerce(what: str, name: str, value: Any, default: Any) -> Any:
+def _coerce(what: str, name: str, value: object, default: bool | int | float | tuple) -> Any:
     """Return ``value`` as the kind of thing that ``default`` is, or raise UserError."""
     wrong = f"{what}: {name}={value!r} must be"
     if isinstance(default, bool):
@@ -371,7 +406,7 @@ def _coerce(what: str, name: str, value: Any, default: Any) -> Any:
             raise UserError(f"{wrong} a list of whole numbers")
         return tuple(int(item) for item in items)
     if isinstance(default, int):
-        if not _is_integer(value):
+        if not isinstance(value, numbers.Integral) or isinstance(value, bool):
             raise UserError(f"{wrong} a whole number")
         return int(value)
     if not isinstance(value, numbers.Real) or isinstance(value, bool) or not math.isfinite(value):
@@ -379,5 +414,5 @@ def _coerce(what: str, name: str, value: Any, default: Any) -> Any:
     return float(value)
 
 
-def _is_integer(value: Any) -> bool:
+def _is_integer(value: object) -> bool:
     return isinstance(value, numbers.Integral) and not isinstance(value, bool)

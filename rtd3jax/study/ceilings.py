@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rtd3jax.ceilings import Ceiling, ceiling
+from rtd3jax.envs.about import Ceiling
 from rtd3jax.errors import UserError, first_line
-from rtd3jax.files import write_bytes_atomically
+from rtd3jax.evaluation.ceiling import ceiling
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.results import number
-from rtd3jax.versions import versions_of
+from rtd3jax.system.files import write_bytes_atomically
+from rtd3jax.system.versions import versions_of
 
 FILE = "ceilings.json"
 
@@ -31,7 +32,7 @@ def ceilings_of(
         name = " | ".join(world)
         if name not in kept and compute:
             try:
-                kept[name] = _entry(ceiling(cell.make_env()))
+                kept[name] = _entry(ceiling(cell.make_env(), env_id=cell.env))
             except UserError as error:
                 found[world] = {"missing": str(error)}
         if name in kept:

@@ -17,6 +17,7 @@ import time
 import uuid
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from rich.console import Console
@@ -39,9 +40,9 @@ from rtd3jax.study.rundir import (
     parse_log,
     steps_reached,
 )
+from rtd3jax.system.versions import versions_of
 from rtd3jax.training.checkpoint import checkpoint_steps
 from rtd3jax.training.lanes import Job, workers
-from rtd3jax.versions import versions_of
 
 TASKS = "cluster.jsonl"
 """A line per task that ended: its cell, where and when it ran, and from which steps it went on."""
@@ -114,7 +115,7 @@ def train_on_cluster(
         _watch(ray, directory, pending, complaints, early, log, work.quiet)
 
 
-def _alive(ray: Any) -> list[dict]:
+def _alive(ray: ModuleType) -> list[dict]:
     return [node for node in ray.nodes() if node["Alive"]]
 
 
@@ -126,7 +127,7 @@ def _ray() -> Any:
 
 
 @contextlib.contextmanager
-def _connected(ray: Any, address: str) -> Iterator[None]:
+def _connected(ray: ModuleType, address: str) -> Iterator[None]:
     # A task may use fewer GPUs than its node has: Ray hides the others, and shall not hide all
     # from a task that asks for none.
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
@@ -180,7 +181,7 @@ def _need(members: Sequence[Job], work: Work, nodes: Sequence[dict]) -> Need:
 
 
 def _check_nodes(
-    ray: Any, nodes: Sequence[dict], directory: RunDirectory, imports: Sequence[str]
+    ray: ModuleType, nodes: Sequence[dict], directory: RunDirectory, imports: Sequence[str]
 ) -> None:
     """Ask every node for its versions, and whether it sees the run directory.
 
@@ -270,7 +271,7 @@ def _train_cell(
 
 
 def _watch(
-    ray: Any,
+    ray: ModuleType,
     directory: RunDirectory,
     pending: dict[Any, list[Job]],
     complaints: list[str],
@@ -311,7 +312,7 @@ def _bar(quiet: bool) -> Progress:
     )
 
 
-def _outcome(ray: Any, task: Any, directory: RunDirectory, jobs: Sequence[Job]) -> list[str]:
+def _outcome(ray: ModuleType, task: Any, directory: RunDirectory, jobs: Sequence[Job]) -> list[str]:
     """Complaints of a task that ended; one that died leaves its reason with its lanes."""
     try:
         complaints, report = ray.get(task)

@@ -3,7 +3,6 @@
 from collections.abc import Iterable
 
 from rtd3jax.registries import AGENTS
-from rtd3jax.study.results import REFERENCES
 
 OTHER_COLOUR = "#56B4E9"
 """Of an agent that states no colour of its own, or is not registered here."""
@@ -21,5 +20,4 @@ def colour_of(algorithm: str, *, on_dark: bool = False) -> str:
 def ordered(algorithms: Iterable[str]) -> list[str]:
     """Distinct trained agents in the order in which they were registered, unknown ones last."""
     known = list(AGENTS)
-    distinct = set(algorithms) - set(REFERENCES)
-    return sorted(distinct, key=lambda n: (known.index(n) if n in AGENTS else len(known), n))
+    return sorted(set(algorithms), key=lambda n: (known.index(n) if n in AGENTS else len(known), n))

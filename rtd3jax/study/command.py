@@ -33,7 +33,7 @@ def exit_status(work: Callable[[], int], place: Callable[[], Any]) -> int:
     return 2
 
 
-def add_import(group: Any) -> None:
+def add_import(group: argparse._ActionsContainer) -> None:
     """Give a parser, or a group of one, the option whose values go to `import_worlds`."""
     group.add_argument(
         "--import",

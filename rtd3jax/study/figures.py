@@ -19,16 +19,19 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from rtd3jax.study.colours import colour_of, ordered
-from rtd3jax.study.results import REFERENCES, write_bytes_atomically
+from rtd3jax.study.results import is_trained, reference_names, write_bytes_atomically
 from rtd3jax.study.statistics import iqm_bands, seed_means, summarise
 
 REFERENCE_COLOUR = "#777777"
+BOUNDS = ("ceiling", "upper bound")
 REFERENCE_DASHES: dict[str, Any] = {
     "random": (0, (2, 2)),
     "constant": (0, (7, 3)),
     "ceiling": "solid",
     "upper bound": (0, (1, 1)),
 }
+OTHER_DASHES = ((0, (7, 3, 2, 3)), (0, (4, 2)), (0, (7, 2, 2, 2, 2, 2)))
+"""Of an environment's own baselines; a name has the same ones in every figure."""
 MARKERS = "osD^vPX"
 
 # Share of the lower edges of the bands that may fall below a learning-curve panel.
@@ -103,7 +106,7 @@ def final_returns(
     """
     with mpl.rc_context(_STYLE):
         lanes = seed_means(episodes)
-        trained = lanes[~lanes["algorithm"].isin(REFERENCES)]
+        trained = lanes[is_trained(lanes)]
         tasks = _tasks(lanes)
         algorithms = ordered(trained["algorithm"])
         lengths = sorted({int(length) for length in trained["history_length"]})
@@ -249,7 +252,7 @@ def _fit(axes: Axes, values: Iterable[float], references: dict[str, float]) -> N
             axes.axhline(
                 mean,
                 color=REFERENCE_COLOUR,
-                linestyle=REFERENCE_DASHES[name],
+                linestyle=_dashes(name),
                 linewidth=1.2,
                 label=name,
                 zorder=2.5,
@@ -284,7 +287,8 @@ def _reference_means(
     means = {}
     if episodes is not None:
         rows = _of_task(episodes, task)
-        for name in REFERENCES:
+        rows = rows[~is_trained(rows)]
+        for name in reference_names(rows):
             values = rows.loc[rows["algorithm"] == name, "return"].to_numpy(np.float64)
             values = values[np.isfinite(values)]
             if values.size:
@@ -303,13 +307,18 @@ def _reference_handles(means: Iterable[dict[str, float]]) -> list[Line2D]:
             [],
             [],
             color=REFERENCE_COLOUR,
-            linestyle=dashes,
+            linestyle=_dashes(name),
             linewidth=1.2,
-            label=f"{name} policy" if name in REFERENCES else name,
+            label=name if name in BOUNDS else f"{name} policy",
         )
-        for name, dashes in REFERENCE_DASHES.items()
-        if name in present
+        for name in sorted(present, key=lambda name: (name in BOUNDS, name != "random", name))
     ]
+
+
+def _dashes(name: str) -> Any:
+    """The line style of a reference or a bound."""
+    other = OTHER_DASHES[sum(name.encode()) % len(OTHER_DASHES)]
+    return REFERENCE_DASHES.get(name, other)
 
 
 def _panels(rows: int, columns: int, width: float, height: float) -> tuple[Figure, np.ndarray]:

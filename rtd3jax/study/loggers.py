@@ -17,7 +17,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Generic, Protocol, TypeVar
 
 from rtd3jax.errors import UserError, first_line
 from rtd3jax.study.plan import Cell
@@ -38,12 +38,16 @@ class Logger(Protocol):
         """Write what is not written yet."""
 
 
-class PerLane(abc.ABC):
+Run = TypeVar("Run")
+"""What a tracker knows a lane by."""
+
+
+class PerLane(abc.ABC, Generic[Run]):
     """A logger that has a run of its tracker for each lane, begun with the lane's first row."""
 
     def __init__(self, directory: RunDirectory) -> None:
         self._path = directory.path
-        self._runs: dict[tuple[str, int], Any] = {}
+        self._runs: dict[tuple[str, int], Run] = {}
 
     def log(self, cell: Cell, seed: int, row: dict[str, Any]) -> None:
         """A point of the lane's curve."""
@@ -63,40 +67,63 @@ class PerLane(abc.ABC):
                 stack.callback(self._end, run)
 
     @abc.abstractmethod
-    def _begin(self, cell: Cell, seed: int) -> Any:
+    def _begin(self, cell: Cell, seed: int) -> Run:
         """The lane's run."""
 
     @abc.abstractmethod
-    def _points(self, run: Any, values: dict[str, float], step: int) -> None:
+    def _points(self, run: Run, values: dict[str, float], step: int) -> None:
         """Write the values of some metrics."""
 
     @abc.abstractmethod
-    def _end(self, run: Any) -> None:
+    def _end(self, run: Run) -> None:
         """End a run."""
 
 
-class TensorBoard(PerLane):
+class EventWriter(Protocol):
+    """tensorboardX's ``SummaryWriter``."""
+
+    def add_scalar(self, tag: str, value: float, step: int, /) -> object:
+        """A point of a curve."""
+
+    def flush(self) -> None:
+        """Write what waits."""
+
+    def close(self) -> None:
+        """Write what waits, and end."""
+
+
+class WandBRun(Protocol):
+    """A run as ``wandb.init`` returns it."""
+
+    def log(self, row: dict[str, float], /) -> object:
+        """Points of curves."""
+
+    def finish(self) -> object:
+        """End."""
+
+
+class TensorBoard(PerLane[EventWriter]):
     """Event files in ``RUN/tensorboard/<cell>/seed-<n>``."""
 
     def __init__(self, directory: RunDirectory) -> None:
         super().__init__(directory)
         self._make = importlib.import_module("tensorboardX").SummaryWriter
 
-    def _begin(self, cell: Cell, seed: int) -> Any:
+    def _begin(self, cell: Cell, seed: int) -> EventWriter:
         path = self._path / "tensorboard" / cell_name(cell) / f"seed-{seed}"
         # Its queue blocks for ever where the thread that writes has died; a row never fills this.
         return self._make(str(path), max_queue=1000)
 
-    def _points(self, run: Any, values: dict[str, float], step: int) -> None:
+    def _points(self, run: EventWriter, values: dict[str, float], step: int) -> None:
         for name, value in values.items():
             run.add_scalar(name, value, step)
         run.flush()  # what cannot be written is an error here, not only in the tracker's thread
 
-    def _end(self, run: Any) -> None:
+    def _end(self, run: EventWriter) -> None:
         run.close()
 
 
-class WandB(PerLane):
+class WandB(PerLane[WandBRun]):
     """A run of Weights & Biases for each lane; the project is named after the run directory."""
 
     def __init__(self, directory: RunDirectory) -> None:
@@ -106,7 +133,7 @@ class WandB(PerLane):
         if self._mode == "online" and not self._wandb.api.api_key:
             raise UserError("WANDB_MODE is online and there is no key; run wandb login")
 
-    def _begin(self, cell: Cell, seed: int) -> Any:
+    def _begin(self, cell: Cell, seed: int) -> WandBRun:
         name = cell_name(cell)
         run = self._wandb.init(
             project=os.environ.get("WANDB_PROJECT", self._path.resolve().name),
@@ -123,14 +150,14 @@ class WandB(PerLane):
             run.define_metric(name, step_metric="step")
         return run
 
-    def _points(self, run: Any, values: dict[str, float], step: int) -> None:
+    def _points(self, run: WandBRun, values: dict[str, float], step: int) -> None:
         run.log({**values, "step": step})
 
-    def _end(self, run: Any) -> None:
+    def _end(self, run: WandBRun) -> None:
         run.finish()
 
 
-class MLflow(PerLane):
+class MLflow(PerLane[str]):
     """A run of MLflow for each lane, in the experiment named after the run directory."""
 
     def __init__(self, directory: RunDirectory) -> None:

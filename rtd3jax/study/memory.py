@@ -8,8 +8,8 @@ import jax
 from rtd3jax.agents.agent import count_parameters
 from rtd3jax.config import Config
 from rtd3jax.errors import UserError
-from rtd3jax.machine import memory_limit
 from rtd3jax.registries import AGENTS
+from rtd3jax.system.machine import memory_limit
 from rtd3jax.training.lanes import Job, workers
 
 _GRADIENTS = 1.3
@@ -28,7 +28,7 @@ _HEADROOM = 0.8
 def state_bytes(job: Job) -> int:
     """Bytes that a lane keeps: parameters, optimisers, replay, carries, environment; exact."""
 
-    def size(leaf: Any) -> int:
+    def size(leaf: jax.Array | jax.ShapeDtypeStruct) -> int:
         key = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
         return leaf.size * (8 if key else leaf.dtype.itemsize)
 

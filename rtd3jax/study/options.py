@@ -11,14 +11,14 @@ import jax
 
 from rtd3jax.agents.variants import ALGORITHMS
 from rtd3jax.config import Config
-from rtd3jax.envs.registry import DISTURBANCES, ENVIRONMENTS
+from rtd3jax.envs.builtin import DISTURBANCES, ENVIRONMENTS
 from rtd3jax.errors import UserError
-from rtd3jax.files import user_path
 from rtd3jax.registries import AGENTS
 from rtd3jax.study.command import add_import, show_what_can_be_shown
 from rtd3jax.study.loggers import LOGGERS
 from rtd3jax.study.plan import Grid
 from rtd3jax.study.presets import PRESETS
+from rtd3jax.system.files import user_path
 
 _GRID_FIELDS = ("algorithm", "history_length")
 

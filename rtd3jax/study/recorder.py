@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from rtd3jax.evaluate import both_returns
+from rtd3jax.evaluation.rollout import both_returns
 from rtd3jax.study.early import EarlyAnswers
 from rtd3jax.study.loggers import Logger
 from rtd3jax.study.plan import label

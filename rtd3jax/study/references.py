@@ -5,8 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from rtd3jax.evaluate import both_returns
-from rtd3jax.policy import constant_policy, random_policy
+from rtd3jax.envs.registry import about_of
+from rtd3jax.errors import UserError, first_line
+from rtd3jax.evaluation.rollout import both_returns
+from rtd3jax.policies.baselines import constant_policy, random_policy
+from rtd3jax.registries import AGENTS
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.rundir import Reference
 
@@ -14,19 +17,30 @@ EPISODES = 1_000
 
 
 def references_of(cells: Sequence[Cell]) -> list[Reference]:
-    """Uniform random, and the rover's constant command, on each world of a study."""
-    worlds = {(cell.env, cell.disturbance): cell for cell in cells}
-    return [reference for cell in worlds.values() for reference in references_on(cell)]
+    """Uniform random, and the environment's own baselines, on each environment of a study."""
+    distinct = {(cell.env, cell.disturbance): cell for cell in cells}
+    return [reference for cell in distinct.values() for reference in references_on(cell)]
 
 
 def references_on(cell: Cell) -> list[Reference]:
-    """Those of one cell's world."""
+    """Those of one cell's environment.
+
+    Raises:
+        UserError: when a baseline fails, or is no policy that fits the environment.
+    """
     env = cell.make_env()
     policies: dict[str, Any] = {"random": random_policy(env)}
-    if cell.env == "rover":
-        params = env.default_params
-        params = getattr(params, "env", params)  # of a rover with faults
-        policies["constant"] = constant_policy([params.target_speed, params.target_yaw_rate])
+    for name, make_policy in about_of(env, cell.env).baselines.items():
+        if name in AGENTS:
+            raise UserError(f"the baseline {name!r} of {cell.env} has the name of an agent")
+        try:
+            made = make_policy(env)
+            policies[name] = made if hasattr(made, "step") else constant_policy(made)
+        except UserError:
+            raise
+        except Exception as error:  # a user's function may do anything
+            reason = first_line(error)
+            raise UserError(f"the baseline {name!r} of {cell.env} failed: {reason}") from error
     return [
         Reference(
             cell.env,

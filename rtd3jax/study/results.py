@@ -9,7 +9,7 @@ import io
 import math
 import os
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import SupportsFloat
 
 import numpy as np
 import pandas as pd
@@ -17,11 +17,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from rtd3jax.errors import UserError
-from rtd3jax.files import user_path, write_bytes_atomically
+from rtd3jax.system.files import user_path, write_bytes_atomically
 
-# Untrained policies evaluated for comparison. Their EPISODES rows carry history_length 0 and a
-# negative seed, because neither has a meaning for them.
-REFERENCES = ("random", "constant")
+# Policies evaluated for comparison that need no training: uniform random, and the baselines of the
+# environment. Their EPISODES rows carry history_length 0 and this seed, because neither has a
+# meaning for them.
+REFERENCE_SEED = -1
 
 # What identifies one experimental cell; a cell plus a seed is one training lane.
 CELL = ("env", "disturbance", "algorithm", "history_length")
@@ -153,7 +154,18 @@ def _describe(schema: pa.Schema) -> str:
     return "(" + ", ".join(f"{field.name} {field.type}" for field in schema) + ")"
 
 
-def number(value: Any) -> float | None:
+def is_trained(table: pd.DataFrame) -> pd.Series:
+    """Which rows of EPISODES are of trained agents: bool [rows]; the others are of references."""
+    return table["seed"] >= 0
+
+
+def reference_names(table: pd.DataFrame) -> list[str]:
+    """Names of the references in EPISODES: random first, the others by the alphabet."""
+    names = set(table.loc[~is_trained(table), "algorithm"])
+    return sorted(names, key=lambda name: (name != "random", name))
+
+
+def number(value: SupportsFloat) -> float | None:
     """For JSON: five significant digits, or None for what is not finite."""
     value = float(value)
     return float(f"{value:.5g}") if math.isfinite(value) else None

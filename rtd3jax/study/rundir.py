@@ -18,9 +18,8 @@ import numpy as np
 
 from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
-from rtd3jax.files import flatten, read_arrays, user_path, write_arrays, write_bytes_atomically
-from rtd3jax.policy import FORMAT, Policy
-from rtd3jax.saved import read_interface, restore_policy
+from rtd3jax.policies.serialization import read_interface, restore_policy
+from rtd3jax.policies.trained import FORMAT, Policy
 from rtd3jax.study.ceilings import ceilings_of
 from rtd3jax.study.figures import final_returns, learning_curves
 from rtd3jax.study.lock import deriver, is_held
@@ -30,14 +29,21 @@ from rtd3jax.study.results import (
     CURVES,
     EPISODES,
     METRICS,
-    REFERENCES,
+    REFERENCE_SEED,
     read_table,
     write_table,
 )
 from rtd3jax.study.summary import summary_markdown
+from rtd3jax.system.files import (
+    flatten,
+    read_arrays,
+    user_path,
+    write_arrays,
+    write_bytes_atomically,
+)
+from rtd3jax.system.versions import versions_of
 from rtd3jax.training.checkpoint import checkpoint_steps
 from rtd3jax.training.run import check_seeds
-from rtd3jax.versions import versions_of
 
 _CURVE_ARRAYS = ("steps", "returns", "true_returns")
 _FINAL_ARRAYS = ("final_returns", "final_true_returns")
@@ -441,13 +447,12 @@ def cell_name(cell: Cell) -> str:
 
 
 def _reference_rows(reference: Reference) -> list[dict[str, Any]]:
-    assert reference.name in REFERENCES
     key = {
         "env": reference.env,
         "disturbance": reference.disturbance,
         "algorithm": reference.name,
         "history_length": 0,
-        "seed": -1,
+        "seed": REFERENCE_SEED,
     }
     pairs = zip(reference.returns, reference.true_returns, strict=True)
     return [

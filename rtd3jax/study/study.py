@@ -16,8 +16,7 @@ from pathlib import Path
 import pandas as pd
 
 from rtd3jax.errors import UserError
-from rtd3jax.files import user_path
-from rtd3jax.policy import Policy
+from rtd3jax.policies.trained import Policy
 from rtd3jax.study.ceilings import ceilings_of
 from rtd3jax.study.execute import Work, train_here
 from rtd3jax.study.figures import final_returns, learning_curves
@@ -30,6 +29,7 @@ from rtd3jax.study.references import references_of
 from rtd3jax.study.report.page import write_page
 from rtd3jax.study.results import CURVES, EPISODES, METRICS, read_table
 from rtd3jax.study.rundir import RunDirectory
+from rtd3jax.system.files import user_path
 from rtd3jax.training.lanes import workers
 from rtd3jax.training.run import check_seeds, check_strategy
 

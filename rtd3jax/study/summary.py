@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from rtd3jax.study.results import CELL, REFERENCES
+from rtd3jax.study.results import CELL, is_trained, reference_names
 from rtd3jax.study.statistics import Summary, seed_means, summarise
 
 MISSING = "missing"
@@ -58,11 +58,10 @@ def _started_seeds(
     """The seeds seen anywhere, by cell (env, disturbance, algorithm, history length)."""
     started: dict[tuple, set[int]] = {}
     columns = [*CELL, "seed"]
-    for table in (curves[columns].drop_duplicates(), lanes[columns]):
+    for table in (curves[columns].drop_duplicates(), lanes.loc[is_trained(lanes), columns]):
         for env, disturbance, algorithm, length, seed in table.itertuples(index=False):
-            if algorithm not in REFERENCES:
-                cell = (env, disturbance, algorithm, int(length))
-                started.setdefault(cell, set()).add(int(seed))
+            cell = (env, disturbance, algorithm, int(length))
+            started.setdefault(cell, set()).add(int(seed))
     for failure in failures:
         # An incomplete record still appears under "Lanes lost".
         if all(name in failure for name in columns):
@@ -105,13 +104,13 @@ def _task_section(
         rows.append((order, entries))
     lines += [_row(entries) for _, entries in sorted(rows, key=lambda row: row[0])]
 
-    for name in REFERENCES:
-        played = _select(episodes, task)
-        played = played[played["algorithm"] == name]
-        if len(played):
-            entries = [f"{name} (reference)", "–", "–", _spread(summarise(played["return"])), "–"]
-            entries += [_spread(summarise(played["true_return"]))] if differs else []
-            lines.append(_row(entries))
+    references = _select(episodes, task)
+    references = references[~is_trained(references)]
+    for name in reference_names(references):
+        played = references[references["algorithm"] == name]
+        entries = [f"{name} (reference)", "–", "–", _spread(summarise(played["return"])), "–"]
+        entries += [_spread(summarise(played["true_return"]))] if differs else []
+        lines.append(_row(entries))
     if best.get("mean") is not None:
         name = "ceiling" if best["kind"] == "exact" else "ceiling (an upper bound)"
         error = f" ± {_number(best['error'])}" if best["error"] else ""

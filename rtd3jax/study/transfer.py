@@ -9,10 +9,10 @@ import pandas as pd
 
 from rtd3jax.envs.registry import make, parse_disturbance
 from rtd3jax.errors import UserError
-from rtd3jax.evaluate import both_returns
-from rtd3jax.files import write_bytes_atomically
+from rtd3jax.evaluation.rollout import both_returns
 from rtd3jax.study.report.transfer import COLUMNS, FILE
 from rtd3jax.study.rundir import RunDirectory
+from rtd3jax.system.files import write_bytes_atomically
 
 
 def transfer(

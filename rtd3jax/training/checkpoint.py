@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from rtd3jax.errors import UserError
-from rtd3jax.files import read_arrays, write_arrays
+from rtd3jax.system.files import read_arrays, write_arrays
+from rtd3jax.system.versions import versions_of
 from rtd3jax.training.loop import Lane, LaneState, Program
-from rtd3jax.versions import versions_of
 
 DEFAULT_SECONDS = 300.0
 """Between checkpoints of a lane, unless they are so large that they take their time."""
@@ -189,7 +189,7 @@ def from_arrays(
     )
 
 
-def _is_key(leaf: Any) -> bool:
+def _is_key(leaf: jax.Array) -> bool:
     return jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
@@ -197,9 +197,10 @@ def _to_array(leaf: jax.Array) -> np.ndarray:
     return np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
 
 
-def _from_array(array: np.ndarray, leaf: Any, name: str, file: Path) -> jax.Array:
+def _from_array(array: np.ndarray, leaf: jax.Array, name: str, file: Path) -> jax.Array:
     if _is_key(leaf):
-        value = jax.random.wrap_key_data(jnp.asarray(array), impl=leaf.dtype._impl.name)
+        dtype: Any = leaf.dtype
+        value = jax.random.wrap_key_data(jnp.asarray(array), impl=dtype._impl.name)
     else:
         value = jnp.asarray(array)
     if value.shape != leaf.shape or value.dtype != leaf.dtype:
@@ -228,7 +229,7 @@ def _step(file: Path) -> int | None:
     return int(match[1]) if match else None
 
 
-def _difference(there: Any, here: Any) -> str:
+def _difference(there: object, here: object) -> str:
     if isinstance(there, dict) and isinstance(here, dict):
         for name in {**there, **here}:
             if there.get(name) != here.get(name):

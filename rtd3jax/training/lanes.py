@@ -19,8 +19,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rtd3jax.machine import cores
-from rtd3jax.programs import make_room, on_full
+from rtd3jax.system.machine import cores
+from rtd3jax.system.program_cache import make_room, on_full
 from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.loop import HEALTHY, Lane, LaneState, Program
 
@@ -226,14 +226,14 @@ class _Pool:
             self._changed.notify_all()
 
 
-def _work(pool: _Pool, device: Any, checkpoints: Checkpoints | None) -> None:
+def _work(pool: _Pool, device: jax.Device, checkpoints: Checkpoints | None) -> None:
     """A device's worker."""
     # jax_debug_nans would take our own NaN for a fault: points of curves that are not reached yet.
     with jax.debug_nans(False):
         _train(pool, device, checkpoints)
 
 
-def _train(pool: _Pool, device: Any, checkpoints: Checkpoints | None) -> None:
+def _train(pool: _Pool, device: jax.Device, checkpoints: Checkpoints | None) -> None:
     """Chunks of the lagging group, as long as there is one."""
     rates: dict[Any, float] = {}
     while (group := pool.take()) is not None:
@@ -266,7 +266,7 @@ def _advanced(group: Group, state: LaneState, step: int) -> None:
     group.state, group.step = state, step
 
 
-def _chunk(group: Group, device: Any, rates: dict[Any, float]) -> None:
+def _chunk(group: Group, device: jax.Device, rates: dict[Any, float]) -> None:
     program, width = group.jobs[0].program, len(group.jobs)
     lanes = [job.lane for job in group.jobs]
     lane = lanes[0] if width == 1 else jax.tree.map(lambda *leaves: jnp.stack(leaves), *lanes)
@@ -308,7 +308,7 @@ def _let_go() -> None:
         _programs.clear()
 
 
-def _compiled(program: Program, lane: Lane, batched: bool, device: Any) -> tuple[Any, Any]:
+def _compiled(program: Program, lane: Lane, batched: bool, device: jax.Device) -> tuple[Any, Any]:
     """``init`` and ``advance``, compiled once for equal programs."""
     key = (program, _structure(lane), batched, device)
     if key not in _programs:
@@ -321,7 +321,7 @@ def _compiled(program: Program, lane: Lane, batched: bool, device: Any) -> tuple
         return entry.executables
 
 
-def _compile(program: Program, lane: Lane, batched: bool, device: Any) -> tuple[Any, Any]:
+def _compile(program: Program, lane: Lane, batched: bool, device: jax.Device) -> tuple[Any, Any]:
     init, advance = program.init, program.advance
     options = {}
     if batched:

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import lax
+from jax.typing import ArrayLike
 
 from rtd3jax.agents.agent import Agent, make_agent
 from rtd3jax.agents.bounds import Bounds
@@ -29,8 +30,9 @@ from rtd3jax.agents.replay import (
 )
 from rtd3jax.config import Config, traced_fields
 from rtd3jax.envs.interface import action_bounds, foreign_code
-from rtd3jax.evaluate import episode_returns
-from rtd3jax.policy import Policy
+from rtd3jax.evaluation.rollout import episode_returns
+from rtd3jax.policies.trained import Policy
+from rtd3jax.protocols import EnvironmentLike
 from rtd3jax.training.metrics import (
     Averages,
     averaged,
@@ -105,7 +107,7 @@ class Program:
         action_shape: shape of the environment's action.
     """
 
-    env: Any
+    env: EnvironmentLike
     config: Config
     observation_size: int
     action_shape: tuple[int, ...]
@@ -331,7 +333,7 @@ class Program:
 
 
 def make_program(
-    env: Any,
+    env: EnvironmentLike,
     config: Config,
     observation_size: int,
     action_shape: tuple[int, ...],
@@ -349,7 +351,7 @@ def make_program(
     return Program(env, static, observation_size, action_shape)
 
 
-def make_lane(config: Config, seed: int, env_params: Any) -> Lane:
+def make_lane(config: Config, seed: int, env_params: object) -> Lane:
     """A lane of `make_program`'s program, with concrete arrays for leaves."""
     numbers = {name: jnp.float32(getattr(config, name)) for name in traced_fields()}
     numbers["history_length"] = jnp.int32(config.tokens)
@@ -357,7 +359,7 @@ def make_lane(config: Config, seed: int, env_params: Any) -> Lane:
     return Lane(jnp.uint32(seed), Hyperparameters(**numbers), env_params)
 
 
-def _array(leaf: Any) -> jax.Array:
+def _array(leaf: ArrayLike) -> jax.Array:
     return jnp.asarray(leaf, jnp.float32 if isinstance(leaf, float) else None)
 
 

@@ -12,8 +12,9 @@ from rtd3jax.config import Config
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
-from rtd3jax.files import user_path
-from rtd3jax.policy import Policy
+from rtd3jax.policies.trained import Policy
+from rtd3jax.protocols import EnvironmentLike
+from rtd3jax.system.files import user_path
 from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.lanes import (
     Group,
@@ -91,11 +92,11 @@ class Run:
 
 @overload
 def train(
-    env: Any,
+    env: EnvironmentLike,
     config: Config,
     seeds: Iterable[int] = range(5),
     *,
-    params: Any = None,
+    params: object = None,
     progress: bool = True,
     strategy: str | None = None,
     checkpoint_dir: str | Path | None = None,
@@ -105,11 +106,11 @@ def train(
 
 @overload
 def train(
-    env: Any,
+    env: EnvironmentLike,
     config: Sequence[Config],
     seeds: Iterable[int] = range(5),
     *,
-    params: Any = None,
+    params: object = None,
     progress: bool = True,
     strategy: str | None = None,
     checkpoint_dir: str | Path | None = None,
@@ -118,11 +119,11 @@ def train(
 
 
 def train(
-    env: Any,
+    env: EnvironmentLike,
     config: Config | Sequence[Config],
     seeds: Iterable[int] = range(5),
     *,
-    params: Any = None,
+    params: object = None,
     progress: bool = True,
     strategy: str | None = None,
     checkpoint_dir: str | Path | None = None,
@@ -188,7 +189,10 @@ def train(
 
 
 def _checkpoints(
-    directories: Sequence[Path], configs: Sequence[Config], env: Any, seconds: float | None
+    directories: Sequence[Path],
+    configs: Sequence[Config],
+    env: EnvironmentLike,
+    seconds: float | None,
 ) -> Checkpoints:
     world = {"env": str(getattr(env, "name", type(env).__name__)), "params": None}
 
@@ -220,12 +224,12 @@ def _horizon(params: Any) -> int | None:
 
 
 def make_jobs(
-    env: Any,
+    env: EnvironmentLike,
     config: Config,
     seeds: Sequence[int],
     *,
-    params: Any = None,
-    cell: Any = None,
+    params: object = None,
+    cell: object = None,
     window: int | None = None,
 ) -> list[Job]:
     """A job per seed, owned by ``(cell, seed)``; checks the environment.

@@ -7,8 +7,9 @@ import pytest
 from flax import struct
 from gymnax.environments import environment, spaces
 
+from rtd3jax.envs.builtin import DISTURBANCES, ENVIRONMENTS
 from rtd3jax.envs.check import Finding, _equal, check_env, find_problems
-from rtd3jax.envs.registry import DISTURBANCES, ENVIRONMENTS, make
+from rtd3jax.envs.registry import make
 from rtd3jax.errors import UserError
 
 

@@ -5,7 +5,7 @@ import gymnax
 import pytest
 
 import rtd3jax as rtd
-from rtd3jax.envs.rover import Rover
+from rtd3jax.envs.rover.environment import Rover
 
 
 class Brax:

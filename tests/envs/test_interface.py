@@ -11,8 +11,9 @@ import pytest
 from flax import struct
 from gymnax.environments import environment, spaces
 
+from rtd3jax.envs.builtin import DISTURBANCES
 from rtd3jax.envs.interface import action_bounds, describe
-from rtd3jax.envs.registry import DISTURBANCES, make
+from rtd3jax.envs.registry import make
 from rtd3jax.errors import UserError
 
 

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from rtd3jax.envs import registry
-from rtd3jax.envs.disturbances import GaussianNoise, Hidden, Sine
+from rtd3jax.envs.builtin import DISTURBANCES, ENVIRONMENTS
 from rtd3jax.envs.disturbed import Disturbed
-from rtd3jax.envs.faults import Delay, Dropout
-from rtd3jax.envs.process import Chain
-from rtd3jax.envs.registry import DISTURBANCES, ENVIRONMENTS, make, parse_disturbance, register
+from rtd3jax.envs.processes.disturbances import GaussianNoise, Hidden, Sine
+from rtd3jax.envs.processes.faults import Delay, Dropout
+from rtd3jax.envs.processes.process import Chain
+from rtd3jax.envs.registry import make, parse_disturbance, register
 from rtd3jax.errors import UserError, nearest
 
 ALL = [(env, disturbance) for env in ENVIRONMENTS for disturbance in DISTURBANCES[env]]
@@ -225,7 +226,7 @@ def test_malformed_disturbances_are_refused(text):
 
 
 def test_registered_environments_are_made(monkeypatch):
-    monkeypatch.setattr(registry, "_constructors", {})
+    monkeypatch.setattr(registry, "_entries", dict(registry._entries))
     register("mine", lambda disturbance, **parameters: (disturbance, parameters))
     assert make("mine", "wind", speed=2) == ("wind", {"speed": 2})
     with pytest.raises(UserError, match="did you mean 'mine'"):
@@ -241,7 +242,7 @@ def test_registered_environments_are_made(monkeypatch):
 
 
 def test_a_registered_environment_gets_parameters_and_disturbances(monkeypatch):
-    monkeypatch.setattr(registry, "_registered", {})
+    monkeypatch.setattr(registry, "_entries", dict(registry._entries))
     base = make("PointRobot-misc")
     register("robot", base, {"lag": ("action", Delay(3)), "noise": GaussianNoise()})
     env = make("robot", "lag+noise+dropout", max_force=0.2, sigma=0.1, p=0.5)
@@ -260,8 +261,7 @@ def test_a_registered_environment_gets_parameters_and_disturbances(monkeypatch):
 
 
 def test_a_cell_that_runs_again_registers_again(monkeypatch):
-    for name in ("_constructors", "_registered", "_registrants"):
-        monkeypatch.setattr(registry, name, {})
+    monkeypatch.setattr(registry, "_entries", dict(registry._entries))
     base = make("PointRobot-misc")
     cell = compile("register('robot', world, **how)", "cell", "exec")
 

@@ -229,7 +229,7 @@ def test_an_update_is_the_same(batches, name):
 
 def test_the_rover_is_the_same():
     import rtd3jax as rtd
-    from rtd3jax.envs.slip import Ar1SlipState
+    from rtd3jax.envs.rover.slip import Ar1SlipState
 
     env = rtd.make("rover", "ar1-slip", sigma=0.0)
     theirs = Rover(np.random.default_rng(0))

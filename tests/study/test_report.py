@@ -12,7 +12,7 @@ from random_policies import random_policy
 
 import rtd3jax as rtd
 from rtd3jax import report, transfer
-from rtd3jax.ceilings import Ceiling
+from rtd3jax.envs.about import Ceiling
 from rtd3jax.study import ceilings
 from rtd3jax.study.plan import Grid, make_cells
 from rtd3jax.study.report.playback import record_episodes
@@ -57,7 +57,7 @@ def runs(tmp_path_factory):
     found = {}
     with pytest.MonkeyPatch.context() as patch:
         best = Ceiling(-1.2, 0.1, "upper bound")
-        patch.setattr(ceilings, "ceiling", lambda env: best)  # the pendulum's takes seconds
+        patch.setattr(ceilings, "ceiling", lambda env, **_: best)  # the pendulum's takes seconds
         for env, grid in GRIDS.items():
             out = found[env] = tmp_path_factory.mktemp("page") / env
             make_run(out, grid)
@@ -184,7 +184,7 @@ def test_in_a_browser(env, runs):
 
 
 def test_an_unfinished_run_has_a_page_that_says_so(runs, tmp_path, monkeypatch):
-    monkeypatch.setattr(ceilings, "ceiling", lambda env: Ceiling(-1.2, 0.1, "exact"))
+    monkeypatch.setattr(ceilings, "ceiling", lambda env, **_: Ceiling(-1.2, 0.1, "exact"))
     study = json.loads((runs["rover"] / "config.json").read_text())
     hostile = tmp_path / "<script>alert(1)<"
     hostile.mkdir()

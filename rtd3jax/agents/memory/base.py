@@ -166,7 +166,7 @@ def draw_uniform(key: jax.Array, shapes: dict[str, tuple[int, ...]], bound: floa
     }
 
 
-def _shapes(tree: Any) -> tuple[Any, list[str]]:
+def _shapes(tree: object) -> tuple[Any, list[str]]:
     leaves, structure = jax.tree.flatten(tree)
     return structure, [f"{leaf.dtype}{list(leaf.shape)}" for leaf in leaves]
 

@@ -23,9 +23,10 @@ from rtd3jax.study.results import (
     CURVES,
     EPISODES,
     METRICS,
-    REFERENCES,
+    is_trained,
     number,
     read_table,
+    reference_names,
 )
 from rtd3jax.study.rundir import LOG, RunDirectory, lane_of, read_log, steps_reached
 from rtd3jax.study.statistics import Summary, iqm_bands, summarise
@@ -157,11 +158,11 @@ def _references(
 ) -> list[dict[str, Any]]:
     """Mean return of each policy that needs no training."""
     here = episodes[(episodes["env"] == env) & (episodes["disturbance"] == disturbance)]
+    here = here[~is_trained(here)]
     found = []
-    for name in REFERENCES:
+    for name in reference_names(here):
         of_policy = here[here["algorithm"] == name]
-        if len(of_policy):
-            found.append({"name": name, **{m: number(of_policy[m].mean()) for m in measures}})
+        found.append({"name": name, **{m: number(of_policy[m].mean()) for m in measures}})
     return found
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from rtd3jax.errors import UserError, first_line
-from rtd3jax.files import user_path, write_bytes_atomically
 from rtd3jax.study.ceilings import ceilings_of
 from rtd3jax.study.report.data import study_data, tables_of
 from rtd3jax.study.report.playback import recordings
@@ -18,7 +17,8 @@ from rtd3jax.study.report.transfer import FILE as TRANSFER
 from rtd3jax.study.report.transfer import transfer_data
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.statistics import seed_means
-from rtd3jax.versions import versions_of
+from rtd3jax.system.files import user_path, write_bytes_atomically
+from rtd3jax.system.versions import versions_of
 
 NAME = "report.html"
 _GENERATOR = '<meta name="generator" content="rtd3jax">'
@@ -115,7 +115,7 @@ def render(data: dict[str, Any]) -> str:
     return "".join(pieces[part] if index % 2 else part for index, part in enumerate(found))
 
 
-def _json_in_html(data: Any) -> str:
+def _json_in_html(data: object) -> str:
     """JSON in which no character can end a script element."""
     text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     for character in "<>&\u2028\u2029":

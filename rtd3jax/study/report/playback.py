@@ -1,7 +1,7 @@
 """Episodes of trained policies, step by step, small enough to travel inside the page.
 
 Frame t is what followed from the t-th action: the observation that the agent saw next, the true one
-behind it, the action, its reward, and (rover) the slip that it met.
+behind it, the action, its reward, and where the environment tells it what the action met unseen.
 """
 
 import base64
@@ -9,6 +9,7 @@ import dataclasses
 import functools
 import hashlib
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,24 +18,24 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from rtd3jax.envs.disturbances import Hidden
+from rtd3jax.envs.about import Drawing
 from rtd3jax.envs.disturbed import Disturbed
 from rtd3jax.envs.entry import parameters_of
-from rtd3jax.envs.interface import describe, foreign_code
-from rtd3jax.envs.pendulum import Pendulum
-from rtd3jax.envs.process import Chain
-from rtd3jax.envs.rover import Rover
+from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT, describe, foreign_code
+from rtd3jax.envs.processes.disturbances import Hidden
+from rtd3jax.envs.processes.process import Chain
+from rtd3jax.envs.registry import about_of
 from rtd3jax.errors import UserError, first_line
-from rtd3jax.evaluate import DEFAULT_STEP_LIMIT
-from rtd3jax.files import write_bytes_atomically
-from rtd3jax.fit import check_fit
-from rtd3jax.programs import make_room
+from rtd3jax.policies.fit import check_fit
+from rtd3jax.protocols import EnvironmentLike, PolicyLike
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.report.data import rows_of
 from rtd3jax.study.results import number
 from rtd3jax.study.rundir import RunDirectory
+from rtd3jax.system.files import write_bytes_atomically
+from rtd3jax.system.program_cache import make_room
 
-FORMAT = 1
+FORMAT = 2
 EPISODES = 2
 SEED = 0
 """Of the episodes, the same for all agents: in one world they meet the same disturbance."""
@@ -42,11 +43,6 @@ MOST_STEPS = 500
 """Steps of an episode that are kept."""
 MOST_CELLS = 60
 """Cells with two episodes each; in a larger study each has one, so that the page stays small."""
-
-_NAMES = {
-    "pendulum": ["cos θ", "sin θ", "angular velocity"],
-    "rover": ["speed error", "yaw-rate error"],
-}
 
 
 def recordings(
@@ -85,9 +81,16 @@ def recordings(
 
 
 def record_episodes(
-    policy: Any, env: Any, episodes: int, seed: int, steps: int
+    policy: PolicyLike,
+    env: EnvironmentLike,
+    episodes: int,
+    seed: int,
+    steps: int,
+    hidden: Callable[[Any], Any] | None = None,
 ) -> dict[str, np.ndarray]:
     """Play ``episodes`` of ``steps`` at most: arrays [episodes, steps, ...] by name.
+
+    ``hidden`` is that of the environment's `rtd3jax.envs.about.Drawing`.
 
     Episodes are those of ``evaluate(policy, env, episodes, seed)``. ``done`` says in which frame an
     episode ended; later frames mean nothing.
@@ -96,12 +99,12 @@ def record_episodes(
     own = describe(env, params)
     check_fit(policy, own.observation_size, own.action_shape, own.action_low, own.action_high)
     make_room()
-    frames = _play(policy, env, params, jax.random.key(seed), episodes, steps)
+    frames = _play(policy, env, params, jax.random.key(seed), episodes, steps, hidden)
     return {name: np.asarray(value) for name, value in frames.items()}
 
 
-@functools.partial(jax.jit, static_argnames=("env", "episodes", "steps"))
-def _play(policy, env, params, key, episodes, steps):
+@functools.partial(jax.jit, static_argnames=("env", "episodes", "steps", "hidden"))
+def _play(policy, env, params, key, episodes, steps, hidden):
     policy_key, reset_key, step_key = jax.random.split(key, 3)
     with foreign_code():
         observation, state = jax.vmap(env.reset, in_axes=(0, None))(
@@ -112,7 +115,9 @@ def _play(policy, env, params, key, episodes, steps):
     def step(loop, time):
         memory, state, observation = loop
         action, memory = jax.vmap(policy.step)(memory, observation)
-        slip = _slip_of(env, state)
+        met = None
+        if hidden is not None:
+            met = hidden(state.env if isinstance(env, Disturbed) else state)
         keys = jax.random.split(jax.random.fold_in(step_key, time), episodes)
         with foreign_code():
             observation, state, reward, terminated, truncated, info = jax.vmap(
@@ -126,22 +131,13 @@ def _play(policy, env, params, key, episodes, steps):
             "reward": reward.astype(jnp.float32)[:, None],
             "done": terminated.astype(bool) | truncated.astype(bool),
         }
-        if slip is not None:
-            frame["slip"] = slip
+        if met is not None:
+            frame["hidden"] = jnp.asarray(met, jnp.float32).reshape(episodes, -1)
         return (memory, state, observation.astype(jnp.float32)), frame
 
     start = (memory, state, observation.astype(jnp.float32))
     _, frames = jax.lax.scan(step, start, jnp.arange(steps, dtype=jnp.int32))
     return {name: jnp.swapaxes(value, 0, 1) for name, value in frames.items()}
-
-
-def _slip_of(env: Any, state: Any) -> Any:
-    """The slip [..., 2] that a rover's next command meets; None where there is none."""
-    base, state = (env.base, state.env) if isinstance(env, Disturbed) else (env, state)
-    if not isinstance(base, Rover):
-        return None
-    parts = state.slip if type(state.slip) is tuple else (state.slip,)
-    return next((part.slip for part in parts if hasattr(part, "slip")), None)
 
 
 def _recorded(
@@ -152,57 +148,59 @@ def _recorded(
         # One window for all lengths, so that they share a program; a policy minds its own length.
         policy = dataclasses.replace(policy, tokens=longest)
     limit = int(getattr(env.default_params, "max_steps_in_episode", DEFAULT_STEP_LIMIT))
+    drawing = about_of(env, cell.env).drawing or Drawing()
+    steps = min(limit, MOST_STEPS)
     try:
-        frames = record_episodes(policy, env, count, SEED, min(limit, MOST_STEPS))
+        frames = record_episodes(policy, env, count, SEED, steps, drawing.hidden)
     except UserError:
         raise
     except Exception as error:  # a user's environment may do anything
         raise UserError(first_line(error)) from error
     cut = limit > MOST_STEPS and not frames["done"].any(axis=1).all()
     return {
-        **_scene(env, frames["seen"].shape[-1], frames["true"].shape[-1]),
+        **_scene(env, drawing, {name: value.shape[-1] for name, value in frames.items()}),
         "cut": MOST_STEPS if cut else None,
         "runs": [_packed({n: value[k] for n, value in frames.items()}) for k in range(count)],
     }
 
 
-def _scene(env: Any, seen: int, true: int) -> dict[str, Any]:
-    """What the drawing has to know: kind of world, names of elements, and constants."""
-    params, base, elements = env.default_params, env, list(range(true))
+def _scene(env: EnvironmentLike, drawing: Drawing, sizes: dict[str, int]) -> dict[str, Any]:
+    """What the page has to know: kind of scene, names of elements, and constants.
+
+    Args:
+        env: the environment as it was made.
+        drawing: how it is drawn; what it does not name is numbered.
+        sizes: elements of each frame's arrays.
+    """
+    params, elements = env.default_params, list(range(sizes["true"]))
     if isinstance(env, Disturbed):
-        base, process, params = env.base, params.process, params.env
+        process, params = params.process, params.env
         processes = process.processes if isinstance(process, Chain) else (process,)
         for part in processes:
             if isinstance(part, Hidden):
                 del elements[part.element]
-    # Which true element each seen one shows; None where that is not known.
-    known = elements if len(elements) == seen else None
-    if isinstance(base, Pendulum):
-        return {
-            "kind": "pendulum",
-            "names": _NAMES["pendulum"],
-            "elements": known,
-            "seconds": number(params.dt),
-            "constants": {"max_torque": number(params.max_torque)},
-        }
-    if isinstance(base, Rover):
-        names = ("wheelbase", "target_speed", "target_yaw_rate")
-        constants = {name: number(getattr(params, name)) for name in names}
-        return {
-            "kind": "rover",
-            "names": _NAMES["rover"],
-            "elements": known,
-            "seconds": None,  # the rover's step has no length; the page says what it draws
-            "constants": constants,
-        }
-    names_of = [f"o[{k}]" for k in range(true)]
+    seconds = drawing.step_seconds
+    met = None
+    if "hidden" in sizes:
+        names = _names(drawing.hidden_elements, "h", sizes["hidden"])
+        met = {"name": drawing.hidden_name, "elements": names}
     return {
-        "kind": None,
-        "names": names_of,
-        "elements": known,
-        "seconds": None,
-        "constants": {},
+        "kind": drawing.kind,
+        "names": _names(drawing.observation, "o", sizes["true"]),
+        # Which true element each seen one shows; None where that is not known.
+        "elements": elements if len(elements) == sizes["seen"] else None,
+        "actions": _names(drawing.action, "a", sizes["action"]),
+        "seconds": None if seconds is None else number(getattr(params, seconds)),
+        "constants": {name: number(getattr(params, name)) for name in drawing.constants},
+        "hidden": met,
     }
+
+
+def _names(given: tuple[str, ...], letter: str, size: int) -> list[str]:
+    """The names given, if there are as many as elements; else numbered ones."""
+    if len(given) == size:
+        return list(given)
+    return [f"{letter}[{k}]" for k in range(size)]
 
 
 def _packed(frames: dict[str, np.ndarray]) -> dict[str, Any]:

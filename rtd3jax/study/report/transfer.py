@@ -44,5 +44,5 @@ def transfer_data(path: Path) -> list[dict[str, Any]] | None:
     ]
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> Any:
     return value.item() if isinstance(value, np.generic) else value

@@ -14,7 +14,7 @@ function unpack({ scale: scales, data }) {
 function unpackRun(run) {
   const found = { steps: run.steps, true: unpack(run.true), action: unpack(run.action), reward: unpack(run.reward) };
   found.seen = run.seen ? unpack(run.seen) : found.true;
-  if (run.slip) found.slip = unpack(run.slip);
+  if (run.hidden) found.hidden = unpack(run.hidden);
   return found;
 }
 
@@ -232,18 +232,18 @@ const SCENES = {
         const [gx, gy] = place(wanted[t + 1]);
         fill(target, { cx: gx, cy: gy });
         // A wheel that slips pales.
-        wheels.forEach((node, side) => node.setAttribute('opacity', run.slip ? Math.max(0.15, 1 - 2 * run.slip[t][side]).toFixed(2) : 1));
+        wheels.forEach((node, side) => node.setAttribute('opacity', run.hidden ? Math.max(0.15, 1 - 2 * run.hidden[t][side]).toFixed(2) : 1));
       },
       readings: (t) => [
         ['speed', `${fixed(run.true[t][0] + speed, 2)} m/s`], ['yaw rate', `${fixed(run.true[t][1] + turn, 2)} rad/s`],
-        ...(run.slip ? [['slip left, right', `${fixed(run.slip[t][0], 2)}, ${fixed(run.slip[t][1], 2)}`]] : []),
+        ...(run.hidden ? [['slip left, right', `${fixed(run.hidden[t][0], 2)}, ${fixed(run.hidden[t][1], 2)}`]] : []),
         ['reward', fixed(run.reward[t][0], 4)],
       ],
     };
   },
 };
 
-// The signals beneath the scene: truth and observation, their difference, slip, action.
+// The signals beneath the scene: truth and observation, their difference, what is hidden, action.
 function tracesOf(entry, run) {
   const column = (table, k) => table.map((row) => row[k]);
   const found = [];
@@ -260,9 +260,8 @@ function tracesOf(entry, run) {
     const lines = run.seen[0].slice(0, 4).map((_, k) => ({ name: `observed ${k}`, kind: `s${k}`, values: column(run.seen, k) }));
     found.push({ name: 'observation', lines });
   }
-  if (run.slip) found.push({ name: 'disturbance: slip', lines: ['left', 'right'].map((name, k) => ({ name, kind: `s${k}`, values: column(run.slip, k) })) });
-  const actions = { pendulum: ['torque'], rover: ['speed', 'yaw rate'] }[entry.kind] || run.action[0].map((_, k) => `a[${k}]`);
-  found.push({ name: 'action', lines: actions.slice(0, 4).map((name, k) => ({ name, kind: `s${k}`, values: column(run.action, k) })) });
+  if (run.hidden) found.push({ name: `disturbance: ${entry.hidden.name}`, lines: entry.hidden.elements.slice(0, 4).map((name, k) => ({ name, kind: `s${k}`, values: column(run.hidden, k) })) });
+  found.push({ name: 'action', lines: entry.actions.slice(0, 4).map((name, k) => ({ name, kind: `s${k}`, values: column(run.action, k) })) });
   return found;
 }
 

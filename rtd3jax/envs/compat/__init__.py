@@ -1,0 +1,1 @@
+"""Environments of gymnax, Gymnasium and Brax, and ours for Gymnasium."""

@@ -1,0 +1,255 @@
+"""Brax-style environments, those of MuJoCo Playground above all, as gymnax environments.
+
+Such an environment has ``reset(rng) -> State`` and ``step(state, action) -> State``, its State the
+fields obs, reward, done, metrics and info; actions lie within one; randomness comes from a key
+within the state. Nothing of Brax is imported unless an environment is asked for by name.
+"""
+
+from collections.abc import Iterable
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from gymnax.environments import environment, spaces
+from jax.typing import ArrayLike
+
+from rtd3jax.envs.identity import ValueIdentity, strong
+from rtd3jax.envs.interface import foreign_code
+from rtd3jax.errors import UserError, nearest
+
+DEFAULT_EPISODE_LENGTH = 1_000
+"""Steps, as in Brax and in MuJoCo Playground's control suite."""
+
+
+class BraxStateLike(Protocol):
+    """What such an environment's State has: arrays, or dicts of arrays."""
+
+    obs: Any
+    reward: Any
+    done: Any
+    metrics: Any
+    info: Any
+
+
+class BraxLike(Protocol):
+    """A Brax-style environment."""
+
+    @property
+    def action_size(self) -> int:
+        """Elements of an action, which lie within [-1, 1]."""
+
+    def reset(self, rng: jax.Array, /) -> Any:
+        """The first State of an episode."""
+
+    def step(self, state: Any, action: jax.Array, /) -> Any:
+        """The next State."""
+
+
+class BraxParams(struct.PyTreeNode):
+    """What can be set from outside; everything else is the environment's own."""
+
+    max_steps_in_episode: int = DEFAULT_EPISODE_LENGTH
+
+
+class BraxState(struct.PyTreeNode):
+    """One episode."""
+
+    time: jax.Array
+    """int32 []: steps taken"""
+    brax: Any
+    """the environment's own State"""
+
+
+class BraxEnv(ValueIdentity, environment.Environment):
+    """A Brax-style environment behind gymnax's interface; made by `from_brax`.
+
+    ``done`` is a termination, except where the environment says in ``info["truncation"]``, as an
+    EpisodeWrapper does, that it is a time limit. An automatic reset is a whole reset with a new
+    key, computed at every step as everywhere in gymnax. ``info["metrics"]`` has the environment's.
+    """
+
+    def __init__(
+        self,
+        env: BraxLike,
+        default_params: BraxParams,
+        observation_key: str | None,
+        keep: tuple[int, ...],
+    ) -> None:
+        super().__init__()
+        self.brax = env
+        self._default_params = default_params
+        self._observation_key = observation_key
+        self._keep = keep
+
+    def identity(self) -> tuple:
+        """The environment itself, and what is seen of it."""
+        return (self.brax, self._observation_key, self._keep)
+
+    @property
+    def default_params(self) -> BraxParams:
+        """Those given at construction."""
+        return self._default_params
+
+    def reset_env(self, key: jax.Array, params: BraxParams) -> tuple[jax.Array, BraxState]:
+        """Start an episode; the observation is float32 [O]."""
+        with foreign_code():
+            # Brax-style code splits keys of the old kind, and compares their shapes.
+            brax = self.brax.reset(jax.random.key_data(key))
+        return self._observe(brax), strong(BraxState(jnp.zeros((), jnp.int32), brax))
+
+    def step_env(
+        self, key: jax.Array, state: BraxState, action: ArrayLike, params: BraxParams
+    ) -> tuple[jax.Array, BraxState, jax.Array, jax.Array, dict[Any, Any]]:
+        """One control step; ``key`` is not used, as the state has its own."""
+        with foreign_code():
+            brax = self.brax.step(state.brax, jnp.asarray(action, jnp.float32))
+            # A flag that was float32 at reset may come back as a bool, say.
+            brax = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), brax, state.brax)
+        evolved = strong(BraxState(state.time + 1, brax))
+        reward = jnp.asarray(brax.reward, jnp.float32)
+        info = {"metrics": brax.metrics}
+        return self._observe(brax), evolved, reward, self.is_terminated(evolved, params), info
+
+    def _observe(self, brax: BraxStateLike) -> jax.Array:
+        observation = brax.obs
+        if self._observation_key is not None:
+            observation = observation[self._observation_key]
+        return jnp.asarray(observation, jnp.float32)[np.asarray(self._keep)]
+
+    def is_terminated(self, state: BraxState, params: BraxParams) -> jax.Array:
+        """Whether the episode ended by itself."""
+        return state.brax.done.astype(bool) & ~_truncation(state.brax)
+
+    def is_truncated(self, state: BraxState, params: BraxParams) -> jax.Array:
+        """Whether a time limit was reached, this one or the environment's own."""
+        return (state.time >= params.max_steps_in_episode) | _truncation(state.brax)
+
+    @property
+    def name(self) -> str:
+        """The name of the environment's class."""
+        return type(getattr(self.brax, "unwrapped", self.brax)).__name__
+
+    @property
+    def num_actions(self) -> int:
+        """Elements of an action."""
+        return self.brax.action_size
+
+    def action_space(self, params: BraxParams | None = None) -> spaces.Box:
+        """Actions within [-1, 1], which is what Brax's environments expect."""
+        return spaces.Box(-1.0, 1.0, (self.brax.action_size,), jnp.float32)
+
+    def observation_space(self, params: BraxParams | None = None) -> spaces.Box:
+        """Unbounded."""
+        return spaces.Box(-jnp.inf, jnp.inf, (len(self._keep),), jnp.float32)
+
+
+def from_brax(
+    env: BraxLike,
+    *,
+    max_steps_in_episode: int | None = None,
+    observation_key: str | None = None,
+    keep: Iterable[int] | None = None,
+) -> BraxEnv:
+    """A Brax-style environment as a gymnax one, for `train`, `disturb`, `evaluate` and all else.
+
+    ``rtd.from_brax("CheetahRun", keep=range(8))`` shows positions and hides velocities.
+
+    Args:
+        env: an environment of MuJoCo Playground or Brax without wrappers that vmap or reset, or
+            the name of one of MuJoCo Playground (``pip install 'rtd3jax[playground]'``), which is
+            then made with MJX's JAX physics.
+        max_steps_in_episode: the time limit, a truncation; by default the named environment's own,
+            else 1,000.
+        observation_key: which observation, where there is a dict of them; "state" by default.
+        keep: indices of the elements that are seen; all by default.
+
+    Raises:
+        UserError: for what is not such an environment, or indices that it does not have.
+    """
+    if isinstance(env, str):
+        env, length = _load(env)
+        max_steps_in_episode = max_steps_in_episode or length
+    name = type(env).__name__
+    for attribute in ("reset", "step", "action_size"):
+        if not hasattr(env, attribute):
+            raise UserError(
+                f"{name} has no {attribute}: it is not a Brax-style environment "
+                "(reset(rng), step(state, action), action_size)"
+            )
+    length = DEFAULT_EPISODE_LENGTH if max_steps_in_episode is None else max_steps_in_episode
+    if isinstance(length, bool) or length != int(length) or length < 1:
+        raise UserError(f"max_steps_in_episode={length!r} must be an integer of at least 1")
+    observation_key, size = _observation(name, _first_state(env, name), observation_key)
+    indices = tuple(range(size)) if keep is None else tuple(int(index) for index in keep)
+    if not indices or len(set(indices)) < len(indices) or not 0 <= min(indices) <= max(indices):
+        raise UserError(f"keep={list(indices)} must be distinct, not negative, at least one")
+    if max(indices) >= size:
+        raise UserError(f"keep={max(indices)} is not in {name}'s observation of size {size}")
+    return BraxEnv(env, BraxParams(int(length)), observation_key, indices)
+
+
+def _truncation(brax: BraxStateLike) -> jax.Array:
+    """bool []: what an EpisodeWrapper notes; False without one."""
+    return jnp.asarray(brax.info.get("truncation", False)).astype(bool)
+
+
+def _load(name: str) -> tuple[Any, int]:
+    """An environment of MuJoCo Playground, and its episode's length."""
+    try:
+        from mujoco_playground import registry
+    except ImportError as error:
+        raise UserError(
+            f"{name!r} is an environment of MuJoCo Playground: pip install 'rtd3jax[playground]'"
+        ) from error
+    if name not in registry.ALL_ENVS:
+        raise UserError(f"MuJoCo Playground has no {name!r}{nearest(name, registry.ALL_ENVS)}")
+    config = registry.get_default_config(name)
+    overrides = {"impl": "jax"} if "impl" in config else {}
+    return registry.load(name, config_overrides=overrides), int(config.episode_length)
+
+
+def _first_state(env: BraxLike, name: str) -> BraxStateLike:
+    """Shapes of the State of reset."""
+    key = jax.eval_shape(lambda: jax.random.key_data(jax.random.key(0)))
+    try:
+        with foreign_code():
+            state = jax.eval_shape(env.reset, key)
+    except Exception as error:
+        reason = (str(error).strip().splitlines() or [""])[0]
+        raise UserError(f"{name} failed in reset: {type(error).__name__}: {reason}") from error
+    missing = [f for f in ("obs", "reward", "done", "metrics", "info") if not hasattr(state, f)]
+    if missing:
+        raise UserError(f"{name}: the State of reset lacks {', '.join(missing)}")
+    if any(str(key).endswith("first_obs") for key in state.info):
+        raise UserError(
+            f"{name} resets by itself, which hides an episode's final observation: "
+            "give the environment without its AutoResetWrapper"
+        )
+    if state.reward.shape:
+        raise UserError(
+            f"{name} is a batch of {state.reward.shape[0]}: give the environment without its "
+            "VmapWrapper"
+        )
+    return state
+
+
+def _observation(name: str, state: BraxStateLike, key: str | None) -> tuple[str | None, int]:
+    """The key of the observation to be seen, if there are several, and its size."""
+    observation = state.obs
+    if isinstance(observation, dict) or hasattr(observation, "keys"):
+        key = "state" if key is None else key
+        if key not in observation:
+            raise UserError(
+                f"{name} has no observation {key!r} (it has {', '.join(observation)}): "
+                "choose by observation_key"
+            )
+        observation = observation[key]
+    elif key is not None:
+        raise UserError(f"{name} has one observation and no keys; leave out observation_key")
+    if len(observation.shape) != 1:
+        raise UserError(
+            f"{name}: the observation has shape {observation.shape}; flatten it to one dimension"
+        )
+    return key, observation.shape[0]

@@ -1,0 +1,228 @@
+"""Our worlds as Gymnasium environments: one at a time, numpy in and out, seeded by reset.
+
+gymnasium is imported by gymnax already, so that nothing here makes importing rtd3jax slower.
+"""
+
+import functools
+import os
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnax.environments import spaces
+from jax.typing import ArrayLike
+
+from rtd3jax.envs.builtin import DISTURBANCES
+from rtd3jax.envs.entry import parameters_of
+from rtd3jax.envs.interface import (
+    check_final_observation,
+    environment_name,
+    foreign_code,
+    trace_reset,
+    trace_step,
+)
+from rtd3jax.envs.registry import make
+from rtd3jax.errors import UserError
+from rtd3jax.protocols import EnvironmentLike
+
+NAMESPACE = "rtd3jax"
+
+_PROCESS = os.getpid()
+"""The process that imported JAX; forked ones inherit its locks but not its threads."""
+
+_seen: dict[Any, tuple[gymnasium.Space, gymnasium.Space]] = {}
+"""Spaces of what was made, for forked processes, which cannot find them out."""
+
+
+def _check_process() -> None:
+    """Raise UserError in a forked process, where JAX would wait for ever."""
+    if os.getpid() != _PROCESS:
+        raise UserError(
+            "JAX does not work in a forked process, where it would hang; start processes with "
+            'spawn: AsyncVectorEnv(..., context="spawn"), or gymnasium.make_vec(..., '
+            'vectorization_mode="async", vector_kwargs={"context": "spawn"})'
+        )
+
+
+class GymnasiumEnv(gymnasium.Env):
+    """A gymnax environment behind Gymnasium's interface; made by `to_gymnasium`.
+
+    The reset and the step are compiled programs. ``step`` returns the final observation of an
+    episode and does not begin another; only ``reset`` does. A time limit is ``truncated``. ``info``
+    has what the environment put there, as numpy arrays.
+    """
+
+    metadata = {"render_modes": []}
+
+    def __init__(self, env: Any, params: Any = None) -> None:
+        self.world = env
+        self.params = parameters_of(env, params)
+        self.action_space, self.observation_space = _spaces(env, self.params)
+        self._key: Any = None
+        self._state: Any = None
+        self._time = 0
+        self._over = True
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin an episode; a ``seed`` decides it and, without further seeds, all that follow."""
+        _check_process()
+        super().reset(seed=seed)
+        self._key = np.uint32(self.np_random.integers(2**32, dtype=np.uint32))
+        self._time, self._over = 0, False
+        observation, self._state = _reset(self.world, self.params, self._key)
+        return self._observation(observation), {}
+
+    def step(self, action: ArrayLike) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """One step of the episode; gymnasium.error.ResetNeeded after its end."""
+        _check_process()
+        if self._over:
+            raise gymnasium.error.ResetNeeded("the episode is over, or none has begun: call reset")
+        action = np.asarray(action, self.action_space.dtype).reshape(self.action_space.shape)
+        time = np.uint32(self._time)
+        final, self._state, reward, terminated, truncated, info = _step(
+            self.world, self.params, self._key, time, self._state, action
+        )
+        self._time += 1
+        self._over = bool(terminated) or bool(truncated)
+        info = jax.tree.map(np.asarray, info)
+        return self._observation(final), float(reward), bool(terminated), bool(truncated), info
+
+    def _observation(self, observation: Any) -> np.ndarray:
+        return np.asarray(observation, self.observation_space.dtype)
+
+
+class _Forked(GymnasiumEnv):
+    """Stands for an environment in a forked process, until it can tell the parent: at reset.
+
+    What a vector environment's process raises earlier does not reach the one that uses it.
+    """
+
+    def __init__(self, key: Any) -> None:
+        if key not in _seen:
+            _check_process()
+        self.action_space, self.observation_space = _seen[key]
+
+
+def to_gymnasium(env: Any, *, params: Any = None) -> GymnasiumEnv:
+    """Any gymnax >= 1.0 environment as a ``gymnasium.Env``, ours or anyone's, discrete or not.
+
+    ``gymnasium.make("rtd3jax/Rover-ar1-slip-v0", sigma=0.1)`` does the same by name, once rtd3jax
+    is imported; ``gymnasium.make("rtd3jax:rtd3jax/Rover-ar1-slip-v0")`` imports it.
+
+    Args:
+        env: the environment; its time limit is reported as ``truncated``.
+        params: its parameters; its own by default.
+
+    Raises:
+        UserError: for what is not a gymnax >= 1.0 environment; in forked processes.
+    """
+    return _made(id(env), lambda: GymnasiumEnv(env, params))
+
+
+def make_gymnasium(env_id: str, disturbance: str, **parameters: Any) -> GymnasiumEnv:
+    """The entry point of the registered ids."""
+    key = env_id, disturbance, repr(parameters)
+    return _made(key, lambda: GymnasiumEnv(make(env_id, disturbance, **parameters)))
+
+
+def _made(key: Any, construct: Callable[[], GymnasiumEnv]) -> GymnasiumEnv:
+    """What ``construct`` makes, or in a forked process what stands for it."""
+    if os.getpid() != _PROCESS:
+        return _Forked(key)
+    env = construct()
+    _seen[key] = env.action_space, env.observation_space
+    return env
+
+
+def gymnasium_id(env_id: str, disturbance: str) -> str:
+    """``rtd3jax/Pendulum-random-sine-v0`` for the pendulum's random-sine."""
+    return f"{NAMESPACE}/{env_id.capitalize()}-{disturbance}-v0"
+
+
+def register_with_gymnasium() -> None:
+    """Register every world with each of its disturbances; makes and imports nothing."""
+    for env_id, disturbances in DISTURBANCES.items():
+        for disturbance in disturbances:
+            if gymnasium_id(env_id, disturbance) not in gymnasium.registry:
+                gymnasium.register(
+                    id=gymnasium_id(env_id, disturbance),
+                    entry_point=f"{__name__}:make_gymnasium",
+                    kwargs={"env_id": env_id, "disturbance": disturbance},
+                )
+
+
+def _spaces(env: EnvironmentLike, params: object) -> tuple[gymnasium.Space, gymnasium.Space]:
+    """Spaces of actions and observations; UserError for what is no gymnax >= 1.0 environment."""
+    name = environment_name(env)
+    with foreign_code():
+        actions = _gymnasium_space(name, "action", env.action_space(params))
+    observation, state = trace_reset(env, params)
+    action = jax.ShapeDtypeStruct(actions.shape or (), actions.dtype or jnp.float32)
+    after = trace_step(env, params, state, action)
+    if not hasattr(observation, "dtype"):
+        raise UserError(
+            f"environment {name}: the observation is a {type(observation).__name__}; "
+            "concatenate its parts into one array"
+        )
+    check_final_observation(name, after[-1], observation)
+    declaring: Any = env
+    try:
+        with foreign_code():
+            seen = _gymnasium_space(name, "observation", declaring.observation_space(params))
+    except (AttributeError, NotImplementedError):
+        seen = gymnasium.spaces.Box(-np.inf, np.inf, observation.shape, np.float32)
+    if seen.shape != observation.shape:
+        raise UserError(
+            f"environment {name}: observation_space has shape {seen.shape}, "
+            f"the observation {observation.shape}; make them the same"
+        )
+    return actions, seen
+
+
+def _gymnasium_space(name: str, what: str, space: object) -> gymnasium.Space:
+    if isinstance(space, spaces.Discrete):
+        return gymnasium.spaces.Discrete(int(space.n))
+    if not isinstance(space, spaces.Box):
+        raise UserError(
+            f"environment {name}: the {what} space {type(space).__name__} is neither Box nor "
+            f"Discrete; flatten the {what} into one Box"
+        )
+    dtype = np.dtype(space.dtype)
+    low, high = (
+        np.broadcast_to(np.asarray(bound, dtype), space.shape) for bound in (space.low, space.high)
+    )
+    return gymnasium.spaces.Box(low, high, tuple(space.shape), dtype.type)
+
+
+@functools.partial(jax.jit, static_argnames="env")
+def _reset(env: EnvironmentLike, params: object, key: jax.Array) -> tuple[jax.Array, Any]:
+    with foreign_code():
+        return env.reset(jax.random.key(key), params)
+
+
+@functools.partial(jax.jit, static_argnames="env")
+def _step(
+    env: EnvironmentLike,
+    params: object,
+    key: jax.Array,
+    time: jax.Array,
+    state: object,
+    action: jax.Array,
+) -> tuple:
+    """The six values, with the observation before any automatic reset."""
+    # Apart from the key of reset, which draws from the episode's key itself.
+    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(key), 1 << 31), time)
+    with foreign_code():
+        _, state, reward, terminated, truncated, info = env.step(key, state, action, params)
+    final = info["final_observation"]
+    rest = {
+        name: value
+        for name, value in info.items()
+        if name not in ("final_observation", "terminated", "truncated")
+    }
+    return final, state, jnp.asarray(reward, jnp.float32), terminated, truncated, rest

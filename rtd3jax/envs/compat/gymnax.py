@@ -1,0 +1,58 @@
+"""gymnax's own environments by their ids."""
+
+from typing import Any
+
+import gymnax
+import jax
+from jax.typing import ArrayLike
+
+from rtd3jax.envs.identity import ValueIdentity, strong, with_identity
+from rtd3jax.envs.interface import foreign_code
+from rtd3jax.errors import UserError
+
+
+class _Preset(ValueIdentity):
+    """A gymnax environment whose ``default_params`` are given, and whose states are strong.
+
+    It is foreign code, which strict promotion would refuse.
+    """
+
+    _preset_id: str
+    _preset_params: Any
+
+    def identity(self) -> tuple:
+        """The id: gymnax never lets an id be made anew by another factory."""
+        return (self._preset_id,)
+
+    @property
+    def default_params(self) -> Any:
+        """gymnax's, with the parameters given to ``make``."""
+        return self._preset_params
+
+    def step(
+        self, key: jax.Array, state: object, action: ArrayLike, params: object = None
+    ) -> tuple:
+        """Step as gymnax does, with a strong state."""
+        with foreign_code():
+            observation, state, *rest = super().step(key, state, action, params)
+        return (observation, strong(state), *rest)
+
+    def reset(self, key: jax.Array, params: object = None) -> tuple:
+        """Reset as gymnax does, with a strong state."""
+        with foreign_code():
+            observation, state = super().reset(key, params)
+        return observation, strong(state)
+
+
+def make_gymnax(env_id: str, params: object = None) -> Any:
+    """gymnax's environment with ``params`` for its defaults; None means gymnax's own."""
+    try:
+        base, defaults = gymnax.make(env_id)
+    except Exception as error:
+        raise UserError(
+            f"environment {env_id} cannot be made: {type(error).__name__}: {error}"
+        ) from error
+    env: Any = object.__new__(with_identity(_Preset, type(base)))  # type: ignore[arg-type]
+    params = defaults if params is None else params
+    env.__dict__.update(vars(base), _preset_id=env_id, _preset_params=params)
+    return env

@@ -1,0 +1,1 @@
+"""gymnax's pendulum, whose observation is disturbed."""

@@ -1,0 +1,1 @@
+"""Hidden processes that disturb an observation, an action or a reward."""

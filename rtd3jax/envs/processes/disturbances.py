@@ -1,0 +1,277 @@
+"""Disturbances of an observation [O] (paper, Section 5.2). Time is counted in environment steps.
+
+They act on what the agent sees, never on the true state. Every draw is made once per episode,
+unless a docstring says otherwise.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax.typing import ArrayLike
+
+from rtd3jax.envs.processes.process import Process, float32, require, require_ordered
+from rtd3jax.errors import UserError
+
+
+def element_mask(elements: tuple[int, ...], size: int) -> np.ndarray:
+    """Ones [O] at the disturbed elements, zeros elsewhere."""
+    mask = np.zeros(size, np.float32)
+    mask[list(elements)] = 1.0
+    return mask
+
+
+def check_elements(process: object, elements: tuple[int, ...], size: int | None = None) -> None:
+    """Raise UserError unless the elements are distinct indices of an observation of ``size``."""
+    name = type(process).__name__
+    if not elements or len(set(elements)) != len(elements) or min(elements) < 0:
+        raise UserError(f"{name}: elements {elements} must be distinct, not negative, at least one")
+    if size is not None and max(elements) >= size:
+        raise UserError(f"{name}: element {max(elements)} is not in an observation of size {size}")
+
+
+def _between(key: jax.Array, low: ArrayLike, high: ArrayLike, shape: tuple[int, ...]) -> jax.Array:
+    """Uniform float32 draws between two parameters."""
+    return jax.random.uniform(key, shape, jnp.float32, float32(low), float32(high))
+
+
+class PulsesState(struct.PyTreeNode):
+    """Where the episode is in the placement of its pulses; all scalars []."""
+
+    slots: jax.Array
+    """int32: places left, a place being either one free step or one whole pulse."""
+    pulses: jax.Array
+    """int32: pulses still to come."""
+    running: jax.Array
+    """int32: steps left of the pulse under way, 0 between pulses."""
+    amplitude: jax.Array
+    """float32: of the latest pulse."""
+
+
+class Pulses(Process):
+    """``temporal-bias``: short constant offsets at random steps (paper, Section 5.2).
+
+    All placements in which the pulses do not overlap and all fit the episode are equally likely.
+    They are found on the way: a place becomes a pulse with probability (pulses left) / (places
+    left), which is Knuth's selection sampling (TAOCP 3.4.2, algorithm S). So a reset costs nothing,
+    which matters where an automatic reset is computed at every step. In an episode too short
+    for all pulses they follow one another from the start until it ends.
+    """
+
+    amplitude_min: float = 0.5
+    amplitude_max: float = 1.0
+    """The amplitude is drawn per pulse [choice]: the paper gives the range only."""
+    count: int = struct.field(pytree_node=False, default=10)
+    length: int = struct.field(pytree_node=False, default=3)
+    elements: tuple[int, ...] = struct.field(pytree_node=False, default=(0, 1))
+
+    def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> PulsesState:
+        """All pulses to come."""
+        zero = jnp.zeros((), jnp.int32)
+        return PulsesState(
+            slots=jnp.asarray(horizon, jnp.int32) - self.count * (self.length - 1),
+            pulses=zero + self.count,
+            running=zero,
+            amplitude=jnp.zeros((), jnp.float32),
+        )
+
+    def step(
+        self, key: jax.Array, state: PulsesState, signal: jax.Array
+    ) -> tuple[jax.Array, PulsesState]:
+        """Start a pulse or not; add the one that runs."""
+        key_start, key_amplitude = jax.random.split(key)
+        idle = state.running == 0
+        draw = jax.random.uniform(key_start, (), jnp.float32) * state.slots.astype(jnp.float32)
+        start = idle & (state.pulses > 0) & (draw < state.pulses.astype(jnp.float32))
+        amplitude = jnp.where(
+            start,
+            _between(key_amplitude, self.amplitude_min, self.amplitude_max, ()),
+            state.amplitude,
+        )
+        running = jnp.where(start, jnp.full_like(state.running, self.length), state.running)
+        offset = jnp.where(running > 0, amplitude, jnp.zeros_like(amplitude))
+        evolved = PulsesState(
+            slots=state.slots - idle.astype(jnp.int32),
+            pulses=state.pulses - start.astype(jnp.int32),
+            running=jnp.maximum(running - 1, 0),
+            amplitude=amplitude,
+        )
+        return signal + element_mask(self.elements, signal.shape[-1]) * offset, evolved
+
+    def output_size(self, size: int) -> int:
+        """Unchanged."""
+        check_elements(self, self.elements, size)
+        return size
+
+    def validate(self) -> None:
+        """Check the range of the amplitude and the counts."""
+        require(self, "amplitude_min")
+        require(self, "amplitude_max")
+        require_ordered(self, "amplitude_min", "amplitude_max")
+        require(self, "count", low=0)
+        require(self, "length", low=1)
+        check_elements(self, self.elements)
+
+
+class SineState(struct.PyTreeNode):
+    """An episode's waves; W waves."""
+
+    time: jax.Array
+    """int32 []: step of the episode."""
+    amplitude: jax.Array
+    """float32 [W]"""
+    period: jax.Array
+    """float32 [W], steps"""
+    start: jax.Array
+    """float32 [W], a whole number of steps"""
+
+
+class Sine(Process):
+    """Waves ``A sin(2 pi (t - t0)/T)``, each lasting one period (paper, Section 5.2).
+
+    The defaults are ``random-sine``; ``temporal-sine`` fixes A = 1 and T = 70, ``combined-sine``
+    has two waves. The start is a whole step, uniform over those from which a whole period fits the
+    episode [choice]; it is 0 if none does.
+    """
+
+    amplitude_min: float = 0.5
+    amplitude_max: float = 2.0
+    period_min: float = 10.0
+    period_max: float = 100.0
+    elements: tuple[int, ...] = struct.field(pytree_node=False, default=(0, 1, 2))
+    waves: int = struct.field(pytree_node=False, default=1)
+
+    def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> SineState:
+        """Draw amplitude, period and start of every wave."""
+        key_amplitude, key_period, key_start = jax.random.split(key, 3)
+        shape = (self.waves,)
+        period = _between(key_period, self.period_min, self.period_max, shape)
+        latest = jnp.floor(float32(horizon) - period).astype(jnp.int32)
+        start = jax.random.randint(key_start, shape, 0, jnp.maximum(latest, 0) + 1, jnp.int32)
+        return SineState(
+            time=jnp.zeros((), jnp.int32),
+            amplitude=_between(key_amplitude, self.amplitude_min, self.amplitude_max, shape),
+            period=period,
+            start=start.astype(jnp.float32),
+        )
+
+    def step(
+        self, key: jax.Array, state: SineState, signal: jax.Array
+    ) -> tuple[jax.Array, SineState]:
+        """Add the sum of the active waves."""
+        elapsed = state.time.astype(jnp.float32) - state.start
+        wave = state.amplitude * jnp.sin(2.0 * jnp.pi * elapsed / state.period)
+        active = (elapsed >= 0.0) & (elapsed < state.period)
+        offset = jnp.sum(jnp.where(active, wave, jnp.zeros_like(wave)))
+        evolved = state.replace(time=state.time + 1)
+        return signal + element_mask(self.elements, signal.shape[-1]) * offset, evolved
+
+    def output_size(self, size: int) -> int:
+        """Unchanged."""
+        check_elements(self, self.elements, size)
+        return size
+
+    def validate(self) -> None:
+        """Check the ranges of amplitude and period."""
+        _validate_wave(self)
+        require(self, "waves", low=1)
+
+
+class DampedSine(Process):
+    """``exp(-(t - t0)/T) A sin(2 pi (t - t0)/T)`` from t0 to the end (paper, Section 5.2).
+
+    t0 is uniform over the episode's steps; A and T are drawn as for ``random-sine``.
+    """
+
+    amplitude_min: float = 0.5
+    amplitude_max: float = 2.0
+    period_min: float = 10.0
+    period_max: float = 100.0
+    elements: tuple[int, ...] = struct.field(pytree_node=False, default=(0, 1, 2))
+
+    def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> SineState:
+        """Draw amplitude, period and start of the one wave."""
+        key_amplitude, key_period, key_start = jax.random.split(key, 3)
+        start = jax.random.randint(key_start, (1,), 0, jnp.asarray(horizon, jnp.int32), jnp.int32)
+        return SineState(
+            time=jnp.zeros((), jnp.int32),
+            amplitude=_between(key_amplitude, self.amplitude_min, self.amplitude_max, (1,)),
+            period=_between(key_period, self.period_min, self.period_max, (1,)),
+            start=start.astype(jnp.float32),
+        )
+
+    def step(
+        self, key: jax.Array, state: SineState, signal: jax.Array
+    ) -> tuple[jax.Array, SineState]:
+        """Add the wave, which is zero until its start."""
+        elapsed = jnp.maximum(state.time.astype(jnp.float32) - state.start, 0.0)
+        cycles = elapsed / state.period
+        offset = jnp.sum(state.amplitude * jnp.exp(-cycles) * jnp.sin(2.0 * jnp.pi * cycles))
+        evolved = state.replace(time=state.time + 1)
+        return signal + element_mask(self.elements, signal.shape[-1]) * offset, evolved
+
+    def output_size(self, size: int) -> int:
+        """Unchanged."""
+        check_elements(self, self.elements, size)
+        return size
+
+    def validate(self) -> None:
+        """Check the ranges of amplitude and period."""
+        _validate_wave(self)
+
+
+def _validate_wave(process: Sine | DampedSine) -> None:
+    """Raise UserError unless amplitude, period and elements make sense."""
+    require(process, "amplitude_min")
+    require(process, "amplitude_max")
+    require_ordered(process, "amplitude_min", "amplitude_max")
+    require(process, "period_min", above=0)
+    require(process, "period_max", above=0)
+    require_ordered(process, "period_min", "period_max")
+    check_elements(process, process.elements)
+
+
+class GaussianNoise(Process):
+    """``noise``: independent N(0, sigma^2) on every element at every step (paper, Section 5.2)."""
+
+    sigma: float = 0.5
+
+    def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> tuple[()]:
+        """No state: the noise is white."""
+        return ()
+
+    def step(
+        self, key: jax.Array, state: tuple[()], signal: jax.Array
+    ) -> tuple[jax.Array, tuple[()]]:
+        """Add the noise."""
+        noise = jax.random.normal(key, signal.shape, jnp.float32)
+        return signal + float32(self.sigma) * noise, state
+
+    def validate(self) -> None:
+        """Check sigma."""
+        require(self, "sigma", low=0)
+
+
+class Hidden(Process):
+    """``hidden``: one element is removed, the pendulum's angular velocity (paper, Section 5.2)."""
+
+    element: int = struct.field(pytree_node=False, default=2)
+
+    def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> tuple[()]:
+        """No state."""
+        return ()
+
+    def step(
+        self, key: jax.Array, state: tuple[()], signal: jax.Array
+    ) -> tuple[jax.Array, tuple[()]]:
+        """Remove the element: [O] -> [O-1]."""
+        return jnp.concatenate([signal[: self.element], signal[self.element + 1 :]]), state
+
+    def output_size(self, size: int) -> int:
+        """One less."""
+        check_elements(self, (self.element,), size)
+        return size - 1
+
+    def validate(self) -> None:
+        """Check the element."""
+        check_elements(self, (self.element,))

@@ -1,0 +1,163 @@
+"""Hidden processes: what changes a signal from step to step, drawn anew every episode.
+
+A process is a pytree. Its numeric parameters are leaves, so a program is compiled once for all of
+their values and can be vmapped over them; its structural choices are static.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax.typing import ArrayLike
+
+from rtd3jax.errors import UserError
+
+
+class Process(struct.PyTreeNode):
+    """Base of every process. ``signal`` is a float vector, [O] observations or [2] wheel speeds."""
+
+    def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> Any:
+        """Draw the state of an episode of ``horizon`` steps (may be traced), signals [size]."""
+        raise NotImplementedError
+
+    def step(self, key: jax.Array, state: Any, signal: jax.Array) -> tuple[jax.Array, Any]:
+        """Return what becomes of this step's signal, and the state of the next step."""
+        raise NotImplementedError
+
+    def output_size(self, size: int) -> int:
+        """Elements that leave for ``size`` that enter; raises UserError if they do not fit."""
+        return size
+
+    def validate(self) -> None:
+        """Raise UserError, naming the parameter, if a concrete parameter makes no sense."""
+
+
+class Nothing(Process):
+    """Leaves the signal as it is."""
+
+    def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> tuple[()]:
+        """No state."""
+        return ()
+
+    def step(
+        self, key: jax.Array, state: tuple[()], signal: jax.Array
+    ) -> tuple[jax.Array, tuple[()]]:
+        """The signal and the empty state, unchanged."""
+        return signal, state
+
+
+class Chain(Process):
+    """Several processes in sequence, the first acting first, each with its own random stream."""
+
+    processes: tuple[Process, ...] = ()
+
+    def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> tuple:
+        """The tuple of the members' states."""
+        states = []
+        for index, process in enumerate(self.processes):
+            states.append(process.init(jax.random.fold_in(key, index), horizon, size))
+            size = process.output_size(size)
+        return tuple(states)
+
+    def step(self, key: jax.Array, state: tuple, signal: jax.Array) -> tuple[jax.Array, tuple]:
+        """Pass the signal through the members in order."""
+        states = []
+        for index, (process, inner) in enumerate(zip(self.processes, state, strict=True)):
+            signal, inner = process.step(jax.random.fold_in(key, index), inner, signal)
+            states.append(inner)
+        return signal, tuple(states)
+
+    def output_size(self, size: int) -> int:
+        """The size after the last member."""
+        for process in self.processes:
+            size = process.output_size(size)
+        return size
+
+    def validate(self) -> None:
+        """Validate every member."""
+        for process in self.processes:
+            process.validate()
+
+
+class Sum(Process):
+    """Several processes side by side: each sees the clean signal, and what they add is added up.
+
+    Each has its own random stream. In a `Chain` a later member sees what the earlier ones made of
+    the signal; here none sees another's work, and their order does not matter.
+    """
+
+    processes: tuple[Process, ...] = ()
+
+    def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> tuple:
+        """The tuple of the members' states."""
+        return tuple(
+            process.init(jax.random.fold_in(key, index), horizon, size)
+            for index, process in enumerate(self.processes)
+        )
+
+    def step(self, key: jax.Array, state: tuple, signal: jax.Array) -> tuple[jax.Array, tuple]:
+        """Add every member's offset to the signal."""
+        total, states = signal, []
+        for index, (process, inner) in enumerate(zip(self.processes, state, strict=True)):
+            disturbed, inner = process.step(jax.random.fold_in(key, index), inner, signal)
+            total = total + (disturbed - signal)
+            states.append(inner)
+        return total, tuple(states)
+
+    def output_size(self, size: int) -> int:
+        """Unchanged; UserError for a member that adds or removes elements."""
+        for process in self.processes:
+            if process.output_size(size) != size:
+                raise UserError(
+                    f"Sum: {type(process).__name__} changes the number of elements, so that what "
+                    "it adds is not defined; put it into a Chain"
+                )
+        return size
+
+    def validate(self) -> None:
+        """Validate every member."""
+        for process in self.processes:
+            process.validate()
+
+
+def float32(value: ArrayLike) -> jax.Array:
+    """A parameter as a strong float32 array, whatever kind of number it was given as."""
+    return jnp.asarray(value, jnp.float32)
+
+
+def require(
+    process: object, name: str, low: float = -np.inf, high: float = np.inf, above: float = -np.inf
+) -> None:
+    """Raise UserError unless field ``name`` is finite, in [low, high] and greater than ``above``.
+
+    Traced values are let through: they are not known yet.
+    """
+    value = getattr(process, name)
+    if isinstance(value, jax.core.Tracer):
+        return
+    where = f"{type(process).__name__}: {name}={value}"
+    try:
+        numbers = np.asarray(value, np.float64)
+    except (TypeError, ValueError):
+        raise UserError(f"{where} is not a number") from None
+    if not np.all(np.isfinite(numbers)):
+        raise UserError(f"{where} is not finite")
+    if np.any(numbers < low):
+        raise UserError(f"{where} must be at least {low:g}")
+    if np.any(numbers <= above):
+        raise UserError(f"{where} must be greater than {above:g}")
+    if np.any(numbers > high):
+        raise UserError(f"{where} must be at most {high:g}")
+
+
+def require_ordered(process: object, low_name: str, high_name: str) -> None:
+    """Raise UserError if field ``low_name`` exceeds field ``high_name``."""
+    low, high = getattr(process, low_name), getattr(process, high_name)
+    if isinstance(low, jax.core.Tracer) or isinstance(high, jax.core.Tracer):
+        return
+    if np.any(np.asarray(low) > np.asarray(high)):
+        raise UserError(
+            f"{type(process).__name__}: {low_name}={low} is greater than {high_name}={high}"
+        )

@@ -1,0 +1,187 @@
+"""The rover's best policy, which a trained agent cannot exceed on average.
+
+Slip is exogenous and the motion has no memory, so the best policy is myopic. The last action and
+the observation give the realised slip exactly; the best command then minimises the expected squared
+error under the conditional moments of the next slip.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax.scipy.stats import norm
+
+from rtd3jax.envs.about import Ceiling
+from rtd3jax.envs.processes.process import Nothing, Process
+from rtd3jax.envs.rover.environment import Rover, RoverParams
+from rtd3jax.envs.rover.slip import WHEELS, Ar1Slip, SineSlip
+from rtd3jax.errors import UserError
+from rtd3jax.protocols import EnvironmentLike
+
+
+class BayesState(NamedTuple):
+    """What the Bayes policy remembers.
+
+    Attributes:
+        nominal: float32 [2], wheel speeds last commanded, m/s.
+        slip: float32 [2], the slip last inferred.
+        time: int32 [], steps done.
+    """
+
+    nominal: jax.Array
+    slip: jax.Array
+    time: jax.Array
+
+
+@struct.dataclass
+class BayesPolicy:
+    """The rover's best policy if its wheels slip as ``model`` says; see `bayes_policy`."""
+
+    params: RoverParams
+    model: Process
+
+    def init(self, key: jax.Array | None = None) -> BayesState:
+        """Nothing is known yet; ``key`` is not needed."""
+        zeros = jnp.zeros((2,), jnp.float32)
+        return BayesState(zeros, zeros, jnp.int32(0))
+
+    def step(self, state: BayesState, observation: jax.Array) -> tuple[jax.Array, BayesState]:
+        """The command [2] of least expected squared error."""
+        params = self.params
+        slip = _inferred_slip(params, state, observation)
+        first, second = _traction_moments(self.model, slip, state.time == 0)
+        nominal = _best_wheel_speeds(params, first, second)
+        speed = 0.5 * (nominal[0] + nominal[1])
+        yaw_rate = (nominal[1] - nominal[0]) / params.wheelbase
+        action = jnp.stack((speed, yaw_rate)).astype(jnp.float32)
+        return action, BayesState(nominal, slip, state.time + jnp.int32(1))
+
+
+def bayes_policy(env: EnvironmentLike, model: Process | None = None) -> BayesPolicy:
+    """The best policy of a rover whose slip follows ``model``.
+
+    Args:
+        env: a rover.
+        model: the slip process that the policy believes in; the environment's own by default. A
+            policy may meet another process than its model, as the robustness columns do.
+
+    Raises:
+        UserError: when ``env`` is no rover, or the model's moments are not known.
+    """
+    if not isinstance(env, Rover):
+        raise UserError("bayes_policy is known for the rover alone")
+    params = env.default_params
+    model = params.slip if model is None else model
+    if not isinstance(model, Ar1Slip | Nothing):
+        raise UserError(
+            f"the conditional moments of {type(model).__name__} are not known; "
+            "give an Ar1Slip as the model"
+        )
+    return BayesPolicy(params, model)
+
+
+def best_return(env: EnvironmentLike, episodes: int, seed: int) -> Ceiling | BayesPolicy:
+    """The best policy of a rover, whose return is its ceiling; under the sine slip, a bound.
+
+    Args:
+        env: a rover.
+        episodes: how many the bound averages.
+        seed: of these episodes.
+
+    Raises:
+        UserError: for a rover with faults, or a slip whose moments are not known.
+    """
+    if not isinstance(env, Rover):
+        raise UserError("the rover's ceiling is known under slip alone, without other faults")
+    if isinstance(env.default_params.slip, SineSlip):
+        return _sine_bound(env.default_params, episodes, seed)
+    return bayes_policy(env)
+
+
+def _sine_bound(params: RoverParams, episodes: int, seed: int) -> Ceiling:
+    """A bound for the sine slip: from its second step on a clairvoyant errs nowhere.
+
+    At the first step nothing has been observed, so no policy does better there than the best
+    constant command under the prior.
+    """
+    keys = jax.random.split(jax.random.key(seed), episodes)
+    horizon = params.max_steps_in_episode
+    slip = jax.vmap(lambda key: params.slip.init(key, horizon, WHEELS).slip)(keys)
+    traction = 1.0 - slip
+    nominal = _best_wheel_speeds(params, traction.mean(0), (traction**2).mean(0))
+    realised = traction * nominal[None, :]
+    speed = realised.mean(axis=1)
+    yaw_rate = (realised[:, 1] - realised[:, 0]) / params.wheelbase
+    losses = (speed - params.target_speed) ** 2 + (yaw_rate - params.target_yaw_rate) ** 2
+    returns = -np.asarray(losses, np.float64)
+    return Ceiling(
+        float(returns.mean()), float(returns.std(ddof=1) / np.sqrt(episodes)), "upper bound"
+    )
+
+
+def _inferred_slip(params: RoverParams, state: BayesState, observation: jax.Array) -> jax.Array:
+    """The slip [2] that turned the last command into the observed motion."""
+    speed = observation[0] + params.target_speed
+    turn = 0.5 * params.wheelbase * (observation[1] + params.target_yaw_rate)
+    realised = jnp.stack((speed - turn, speed + turn))
+    moved = jnp.abs(state.nominal) > 1e-6
+    ratio = realised / jnp.where(moved, state.nominal, 1.0)
+    return jnp.where(moved, jnp.clip(1.0 - ratio, 0.0, 1.0), state.slip)
+
+
+def _traction_moments(
+    model: Process, slip: jax.Array, first_step: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """E[1 - s] and E[(1 - s)^2] of the slip that the next command meets, per wheel: [2] each."""
+    if isinstance(model, Nothing):
+        ones = jnp.ones((2,), jnp.float32)
+        return ones, ones
+    assert isinstance(model, Ar1Slip)
+    # s_0 ~ U(0, m); afterwards s' = clip(N(rho s, sigma^2), 0, m).
+    m = jnp.float32(model.max_slip)
+    mean, square = clipped_normal_moments(model.rho * slip, jnp.float32(model.sigma), m)
+    mean = jnp.where(first_step, 0.5 * m, mean)
+    square = jnp.where(first_step, m * m / 3.0, square)
+    return 1.0 - mean, 1.0 - 2.0 * mean + square
+
+
+def clipped_normal_moments(
+    mean: jax.Array, deviation: jax.Array, top: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """E[y] and E[y^2] of ``y = clip(N(mean, deviation^2), 0, top)``, with deviation > 0."""
+    a, b = (0.0 - mean) / deviation, (top - mean) / deviation
+    inside = norm.cdf(b) - norm.cdf(a)
+    slope = norm.pdf(a) - norm.pdf(b)
+    above = norm.sf(b)
+    first = mean * inside + deviation * slope + top * above
+    curve = a * norm.pdf(a) - b * norm.pdf(b)
+    second = (
+        (mean**2 + deviation**2) * inside
+        + 2.0 * mean * deviation * slope
+        + deviation**2 * curve
+        + top**2 * above
+    )
+    return first, second
+
+
+def _best_wheel_speeds(params: RoverParams, first: jax.Array, second: jax.Array) -> jax.Array:
+    """Nominal wheel speeds [2] that minimise the expected squared error of the motion.
+
+    With tractions x and wheel speeds u the motion is v = (x_L u_L + x_R u_R)/2 and
+    omega = (x_R u_R - x_L u_L)/b; the wheels slip independently, so the expectation is a quadratic
+    whose minimum solves two linear equations. The command's bounds are wide enough not to bind.
+    """
+    sum_weight, difference_weight = 0.25, 1.0 / params.wheelbase**2
+    cross = (sum_weight - difference_weight) * first[0] * first[1]
+    diagonal = (sum_weight + difference_weight) * second
+    matrix = jnp.stack((jnp.stack((diagonal[0], cross)), jnp.stack((cross, diagonal[1]))))
+    turn = params.target_yaw_rate / params.wheelbase
+    right = first * jnp.stack(
+        (
+            jnp.float32(0.5 * params.target_speed - turn),
+            jnp.float32(0.5 * params.target_speed + turn),
+        )
+    )
+    return jnp.linalg.solve(matrix, right[:, None])[:, 0]

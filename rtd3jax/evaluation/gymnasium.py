@@ -1,0 +1,113 @@
+"""Policies that were trained here, in Gymnasium's environments."""
+
+from typing import Any
+
+import gymnasium
+import jax
+import numpy as np
+from jax.typing import ArrayLike
+
+from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT
+from rtd3jax.errors import UserError
+from rtd3jax.policies.fit import check_fit
+from rtd3jax.policies.trained import Policy
+from rtd3jax.protocols import PolicyLike
+
+
+def run_in_gymnasium(
+    policy: PolicyLike, gym_env: gymnasium.Env | str, episodes: int = 10, seed: int = 0
+) -> np.ndarray:
+    """Returns of whole episodes: float64 [episodes].
+
+    The action is clipped to the environment's bounds. An episode that has not ended after 10,000
+    steps is cut.
+
+    Args:
+        policy: anything with ``init`` and ``step``; see `rtd3jax.policies`.
+        gym_env: a ``gymnasium.Env`` with a Box of actions, or the id of one. It is left open if it
+            was given open.
+        episodes: how many, one after the other.
+        seed: of the episodes; the first n of more episodes are those of n episodes.
+
+    Raises:
+        UserError: for spaces that do not fit the policy, or impossible arguments; at a step at
+            which an action or a reward is not finite, or the observation for a policy from here.
+    """
+    if isinstance(episodes, bool) or episodes != int(episodes) or episodes < 1:
+        raise UserError(f"episodes must be an integer of at least 1, not {episodes!r}")
+    if isinstance(seed, bool) or seed != int(seed) or seed < 0:
+        raise UserError(f"seed must be an integer of at least 0, not {seed!r}")
+    if not isinstance(gym_env, str):
+        return _play(policy, gym_env, int(episodes), int(seed))
+    try:
+        env = gymnasium.make(gym_env)
+    except (gymnasium.error.Error, ImportError) as error:
+        reason = (str(error).splitlines() or [""])[0]
+        raise UserError(f"Gymnasium cannot make {gym_env!r}: {reason}") from error
+    try:
+        return _play(policy, env, int(episodes), int(seed))
+    finally:
+        env.close()
+
+
+def _play(policy: PolicyLike, env: gymnasium.Env, episodes: int, seed: int) -> np.ndarray:
+    space = _check_fit(policy, env)
+    returns = np.zeros(episodes)
+    # As seeds of their own: neighbouring seeds shall not share episodes.
+    for index, episode_seed in enumerate(np.random.SeedSequence(seed).generate_state(episodes)):
+        observation, _ = env.reset(seed=int(episode_seed))
+        state = policy.init(jax.random.key(int(episode_seed)))
+        for step in range(DEFAULT_STEP_LIMIT):
+            where = f"at step {step} of episode {index}"
+            if isinstance(policy, Policy):
+                _check_finite(where, "environment's observation", observation)
+            action, state = _act(policy, state, np.asarray(observation, np.float32))
+            _check_finite(where, "policy's action", action)
+            action = np.clip(np.asarray(action, space.dtype), space.low, space.high)
+            observation, reward, terminated, truncated, _ = env.step(action)
+            reward = float(reward)
+            _check_finite(where, "environment's reward", reward)
+            returns[index] += reward
+            if terminated or truncated:
+                break
+    return returns
+
+
+def _check_finite(where: str, what: str, value: ArrayLike) -> None:
+    if not np.isfinite(np.asarray(value, np.float64)).all():
+        raise UserError(f"{where} the {what} is {np.asarray(value).tolist()}, which is not finite")
+
+
+@jax.jit
+def _act(policy: PolicyLike, state: object, observation: jax.Array) -> tuple[jax.Array, Any]:
+    return policy.step(state, observation)
+
+
+def _check_fit(policy: PolicyLike, env: gymnasium.Env) -> gymnasium.spaces.Box:
+    """The space of actions; UserError where policy and environment do not fit each other."""
+    if not isinstance(env, gymnasium.Env):
+        raise UserError(
+            f"{type(env).__name__} is not a gymnasium.Env; for a gymnax environment there is "
+            "rtd.evaluate"
+        )
+    actions, observations = env.action_space, env.observation_space
+    if not isinstance(actions, gymnasium.spaces.Box):
+        raise UserError(f"the environment's actions are {actions}; a policy needs a Box")
+    if not isinstance(observations, gymnasium.spaces.Box) or len(observations.shape) != 1:
+        raise UserError(
+            f"the environment's observations are {observations}; a policy needs a flat Box: "
+            "wrap it in gymnasium.wrappers.FlattenObservation"
+        )
+    check_fit(policy, observations.shape[0], actions.shape, actions.low, actions.high)
+    kind = type(policy).__name__
+    seen = jax.ShapeDtypeStruct(observations.shape, np.float32)
+    try:
+        shape = jax.eval_shape(_act, policy, jax.eval_shape(policy.init), seen)[0].shape
+    except TypeError as error:
+        raise UserError(
+            f"{kind} cannot be compiled; make it a flax.struct.dataclass: "
+            f"{(str(error).splitlines() or [''])[0]}"
+        ) from error
+    if shape != actions.shape:
+        raise UserError(f"the policy's action has shape {shape}, the environment's {actions.shape}")
+    return actions

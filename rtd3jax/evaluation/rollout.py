@@ -1,0 +1,122 @@
+"""Deterministic evaluation of any policy on any environment."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+
+from rtd3jax.envs.entry import parameters_of
+from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT, describe, foreign_code
+from rtd3jax.errors import UserError
+from rtd3jax.policies.fit import check_fit
+from rtd3jax.protocols import EnvironmentLike, PolicyLike
+from rtd3jax.system.program_cache import make_room
+
+
+def evaluate(
+    policy: PolicyLike,
+    env: EnvironmentLike,
+    episodes: int = 100,
+    seed: int = 0,
+    *,
+    params: object = None,
+    true_reward: bool = False,
+) -> jax.Array:
+    """Returns of whole episodes: float32 [episodes].
+
+    Args:
+        policy: anything with ``init`` and ``step``; see `rtd3jax.policies`.
+        env: a gymnax >= 1.0 environment.
+        episodes: how many, side by side.
+        seed: of the environment's streams; equal seeds meet equal episodes, whatever the policy.
+        params: the environment's parameters; its own by default.
+        true_reward: count the reward of the undisturbed state, where the environment gives it.
+
+    Raises:
+        UserError: for an unfit environment or impossible arguments.
+    """
+    returns, true_returns = both_returns(policy, env, episodes, seed, params=params)
+    return true_returns if true_reward else returns
+
+
+def both_returns(
+    policy: PolicyLike, env: EnvironmentLike, episodes: int, seed: int, *, params: object = None
+) -> tuple[jax.Array, jax.Array]:
+    """Returns of the reward as given and of the true state's, from the same episodes.
+
+    As `evaluate`, which gives one of the two: float32 [episodes] each.
+    """
+    for name, value, low in (("episodes", episodes, 1), ("seed", seed, 0)):
+        if isinstance(value, bool) or value != int(value) or not low <= value < 2**32:
+            raise UserError(f"{name} must be an integer of at least {low}, not {value!r}")
+    params = parameters_of(env, params)
+    interface = describe(env, params)
+    check_fit(
+        policy,
+        interface.observation_size,
+        interface.action_shape,
+        interface.action_low,
+        interface.action_high,
+    )
+    make_room()
+    key = jax.random.key(int(seed))
+    return _episode_returns(policy, env, params, key, int(episodes))
+
+
+@functools.partial(jax.jit, static_argnames=("env", "episodes"))
+def _episode_returns(policy, env, params, key, episodes):
+    return episode_returns(policy, env, params, key, episodes)
+
+
+def episode_returns(
+    policy: PolicyLike, env: EnvironmentLike, params: object, key: jax.Array, episodes: int
+) -> tuple[jax.Array, jax.Array]:
+    """Returns of the trained and of the true reward, float32 [episodes] each; for use under jit."""
+    policy_key, reset_key, step_key = jax.random.split(key, 3)
+    with foreign_code():
+        observation, env_state = jax.vmap(env.reset, in_axes=(0, None))(
+            jax.random.split(reset_key, episodes), params
+        )
+    policy_state = jax.vmap(policy.init)(jax.random.split(policy_key, episodes))
+    limit = getattr(params, "max_steps_in_episode", DEFAULT_STEP_LIMIT)
+    zeros = jnp.zeros((episodes,), jnp.float32)
+
+    def unfinished(loop):
+        time, alive, *_ = loop
+        return jnp.any(alive) & (time < limit)
+
+    def step(loop):
+        time, alive, policy_state, env_state, observation, total, true_total = loop
+        action, policy_state = jax.vmap(policy.step)(policy_state, observation)
+        keys = jax.random.split(jax.random.fold_in(step_key, time), episodes)
+        with foreign_code():
+            observation, env_state, reward, terminated, truncated, info = jax.vmap(
+                env.step, in_axes=(0, 0, 0, None)
+            )(keys, env_state, action, params)
+        reward = reward.astype(jnp.float32)
+        true = info.get("true_reward", reward).astype(jnp.float32)
+        total = total + jnp.where(alive, reward, 0.0)
+        true_total = true_total + jnp.where(alive, true, 0.0)
+        alive = alive & ~(terminated.astype(bool) | truncated.astype(bool))
+        observation = observation.astype(jnp.float32)
+        return (
+            time + jnp.int32(1),
+            alive,
+            policy_state,
+            env_state,
+            observation,
+            total,
+            true_total,
+        )
+
+    start = (
+        jnp.int32(0),
+        jnp.ones((episodes,), bool),
+        policy_state,
+        env_state,
+        observation.astype(jnp.float32),
+        zeros,
+        zeros,
+    )
+    *_, total, true_total = jax.lax.while_loop(unfinished, step, start)
+    return total, true_total

@@ -1,0 +1,28 @@
+"""The numpy form: one Python file, `rtd3jax.policies.export.player` with the weights in it."""
+
+import base64
+import importlib.resources
+
+from rtd3jax.policies.export.model import Model, check_portable
+
+_ABOUT = "ABOUT: dict[str, Any] = {}\n"
+_WEIGHTS = 'WEIGHTS = ""\n'
+
+
+def numpy_bytes(model: Model) -> bytes:
+    """The source of a module with a class ``Player``: ``reset()``, ``step(observation)``."""
+    check_portable(model, "numpy")
+    shapes = {name: list(array.shape) for name, array in model.arrays.items()}
+    raw = b"".join(array.astype("<f4").tobytes() for array in model.arrays.values())
+    about = repr({**model.header(), "arrays": shapes})
+    text = base64.encodebytes(raw).decode()
+    source = (
+        importlib.resources.files("rtd3jax.policies.export")
+        .joinpath("player.py")
+        .read_text("utf-8")
+    )
+    assert source.count(_ABOUT) == 1 and source.count(_WEIGHTS) == 1
+    source = source.replace(_ABOUT, f"ABOUT: dict[str, Any] = {about}\n")
+    # Last, so that no text of the header can be taken for the mark.
+    head, tail = source.split(_WEIGHTS)
+    return f'{head}WEIGHTS = """\n{text}"""\n{tail}'.encode()

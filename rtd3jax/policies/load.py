@@ -1,0 +1,95 @@
+"""`load_policy`: a trained policy from a file, or from the directory of a sweep."""
+
+import os
+from typing import TYPE_CHECKING, Any
+
+from rtd3jax.errors import UserError
+from rtd3jax.policies.serialization import read_policy
+from rtd3jax.policies.trained import Policy
+from rtd3jax.system.files import user_path
+
+if TYPE_CHECKING:
+    from rtd3jax.study.plan import Cell
+    from rtd3jax.study.rundir import RunDirectory
+
+
+def load_policy(
+    path: str | os.PathLike,
+    *,
+    algorithm: str | None = None,
+    seed: int | None = None,
+    env: str | None = None,
+    disturbance: str | None = None,
+    history_length: int | None = None,
+) -> Policy:
+    """The policy of a file that ``policy.save`` wrote, or of one lane of a run directory.
+
+    Args:
+        path: the file, or the directory that `rtd3jax.sweep` wrote. The other arguments choose
+            among a directory's lanes; those in which its cells agree need not be given.
+        algorithm: the agent's id.
+        seed: of the lane [0].
+        env: the environment's id.
+        disturbance: as it was given to the sweep.
+        history_length: l.
+
+    Raises:
+        UserError: when the file is missing, damaged or no policy; when the lane is missing, lost or
+            not trained yet; when several cells fit.
+    """
+    given: dict[str, Any] = {
+        "env": env,
+        "disturbance": disturbance,
+        "algorithm": algorithm,
+        "history_length": history_length,
+        "seed": seed,
+    }
+    given = {name: value for name, value in given.items() if value is not None}
+    path = user_path(path)
+    try:
+        is_directory = path.is_dir()
+    except OSError as error:
+        raise UserError(f"{path} cannot be read ({error.strerror})") from error
+    if not is_directory:
+        if given:
+            raise UserError(
+                f"{path} is not a run directory, among whose lanes {', '.join(given)} would choose"
+            )
+        return read_policy(path)
+    # Here, because it brings the libraries for tables and pictures, which playing does not need.
+    from rtd3jax.study.rundir import RunDirectory
+
+    directory = RunDirectory.open(path)
+    seed = given.pop("seed", 0)
+    cell = _choose(directory, given)
+    if seed not in directory.seeds:
+        raise UserError(f"{path} has no seed {seed}; its seeds are {directory.seeds}")
+    return directory.policy(cell, seed)
+
+
+def _choose(directory: "RunDirectory", wanted: dict[str, Any]) -> "Cell":
+    """The one cell that is as ``wanted``."""
+    cells = directory.cells
+    for name, value in wanted.items():
+        there = _values(cells, name)
+        cells = [cell for cell in cells if cell.key[name] == value]
+        if not cells:
+            raise UserError(
+                f"{directory.path} has no such cell with {name}={value}; there {name} is "
+                f"{' or '.join(map(str, there))}"
+            )
+    for name in cells[0].key:
+        there = _values(cells, name)
+        if len(there) > 1:
+            raise UserError(
+                f"{len(cells)} cells of {directory.path} fit; say which {name}: "
+                f"{', '.join(map(str, there))}"
+            )
+    if len(cells) > 1:
+        raise UserError(f"{len(cells)} cells of {directory.path} differ in other settings only")
+    return cells[0]
+
+
+def _values(cells: "list[Cell]", name: str) -> list[Any]:
+    """What ``name`` is in these cells."""
+    return list(dict.fromkeys(cell.key[name] for cell in cells))

@@ -1,0 +1,209 @@
+"""Policies from arrays that were written down: checked, then made whole."""
+
+import math
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rtd3jax.agents.agent import make_part
+from rtd3jax.agents.bounds import Bounds
+from rtd3jax.agents.memory.base import Params
+from rtd3jax.agents.networks import NetworkSpec, init_network, part_sizes
+from rtd3jax.config import ACTINGS
+from rtd3jax.envs.interface import Interface
+from rtd3jax.errors import UserError
+from rtd3jax.policies.trained import CARRY_FORMAT, FORMAT, KIND, Policy
+from rtd3jax.registries import AGENTS, MEMORIES
+from rtd3jax.system.files import flatten, read_arrays, unflatten
+
+_FORMATS = (1, FORMAT, CARRY_FORMAT)
+_ACTIONS = ("action", "previous_action")
+_OLD_NAME = re.compile(r"^lstm\.")
+"""How the memory's arrays began when the LSTM was the only one."""
+
+
+def read_policy(path: str | os.PathLike) -> Policy:
+    """The policy that `Policy.save` wrote.
+
+    Raises:
+        UserError: when the file is missing, damaged, something else, of a newer format, or does not
+            hold the arrays that its header announces.
+    """
+    arrays, about = read_arrays(path)
+    if isinstance(about, dict) and "cell" in about and "seed" in about:
+        raise UserError(
+            f"{path} is a lane of a run directory and no saved policy: load it with "
+            f"load_policy({str(Path(path).parents[2])!r}, algorithm=..., seed={about['seed']})"
+        )
+    if not isinstance(about, dict) or about.get("kind") != KIND:
+        raise UserError(f"{path} is not a saved policy")
+    if about.get("format") not in _FORMATS:
+        raise UserError(
+            f"{path} has format {about.get('format')}, and this version of rtd3jax reads up to "
+            f"{CARRY_FORMAT}: use the version that wrote it, or a newer one"
+        )
+    interface, facts = _header(path, about)
+    return restore_policy(path, arrays, interface, **facts)
+
+
+def restore_policy(
+    path: str | os.PathLike,
+    actor: Mapping[str, np.ndarray],
+    interface: Interface,
+    *,
+    algorithm: str,
+    history_length: int,
+    width: int,
+    memory: str = "lstm",
+    acting: str = "window",
+    format: int = FORMAT,
+    centre_token: np.ndarray | None = None,
+) -> Policy:
+    """The policy of an actor's arrays under dotted names.
+
+    Args:
+        path: where they come from, for messages.
+        actor: the arrays.
+        interface: of the environment that the policy is for.
+        algorithm: the agent's id.
+        history_length: l; 0 for td3.
+        width: H.
+        memory: the name of its recurrent cell.
+        acting: ``window`` or ``carry``, as in the policy.
+        format: of the file; an actor of format 1 is converted.
+        centre_token: [A], as in the policy; zero by default.
+
+    Raises:
+        UserError: when an array is missing, too many, of another shape or type, or not finite.
+    """
+    spec = AGENTS[algorithm].actor
+    sizes = part_sizes(interface.observation_size, interface.action_size)
+    network = make_part(AGENTS[algorithm], "actor", memory, *interface.sizes, width)
+    shapes = jax.eval_shape(lambda: init_network(jax.random.key(0), network))
+    actor = {_OLD_NAME.sub("memory.", name): array for name, array in actor.items()}
+    expected = flatten(
+        jax.tree.map(lambda leaf: np.broadcast_to(np.float32(0), leaf.shape), shapes)
+    )
+    for name in sorted(expected.keys() ^ actor.keys()):
+        what = "lacks the array" if name in expected else "has an array too many:"
+        raise UserError(f"{path} does not fit {algorithm}: it {what} {name}")
+    for name, like in expected.items():
+        array = actor[name]
+        if array.shape != like.shape:
+            kind = "for another environment or width" if name.endswith("kernel") else "damaged"
+            raise UserError(
+                f"{path} does not fit {algorithm} with {interface.observation_size} observation "
+                f"elements, {interface.action_size} action elements and width {width}: {name} has "
+                f"shape {list(array.shape)}, not {list(like.shape)}; it is {kind}"
+            )
+        if array.dtype != np.float32:
+            raise UserError(f"{path}: {name} is {array.dtype}, not float32")
+        if not np.all(np.isfinite(array)):
+            raise UserError(f"{path}: the weights are not finite ({name})")
+    bounds = Bounds(jnp.asarray(interface.action_low), jnp.asarray(interface.action_high))
+    if centre_token is None:
+        centre_token = np.zeros(interface.action_size, np.float32)
+    tree = unflatten(actor)
+    if format == 1:
+        tree = _in_half_ranges(tree, spec, sizes, np.asarray(bounds.half_range))
+        centre_token = np.asarray(bounds.centre / bounds.half_range)
+    return Policy(
+        actor=jax.tree.map(jnp.asarray, tree),
+        bounds=bounds,
+        history_length=jnp.int32(history_length),
+        centre_token=jnp.asarray(centre_token),
+        algorithm=algorithm,
+        tokens=history_length,
+        observation_size=interface.observation_size,
+        action_shape=interface.action_shape,
+        memory=memory,
+        acting=acting,
+    )
+
+
+def _in_half_ranges(
+    actor: Params, spec: NetworkSpec, sizes: dict[str, int], half_range: np.ndarray
+) -> Params:
+    """An actor that read actions in the environment's units, as one that reads half ranges.
+
+    A product with an action is one with the action in half ranges and weights times ``half_range``
+    [A].
+    """
+    actor = dict(actor)
+    for layer, parts in (("encoder", spec.memory), ("current", spec.current)):
+        if parts:
+            scales = [half_range if p in _ACTIONS else np.ones(sizes[p]) for p in parts]
+            column = np.concatenate(scales).astype(np.float32)[:, None]
+            actor[layer] = {**actor[layer], "kernel": column * actor[layer]["kernel"]}
+    return actor
+
+
+def _header(path: str | os.PathLike, about: dict[str, Any]) -> tuple[Interface, dict[str, Any]]:
+    """What a file's header says, checked: the interface, and `restore_policy`'s other facts."""
+    wrong = f"{path} is damaged: its header's"
+    algorithm, memory = about.get("algorithm"), about.get("memory", "lstm")
+    if not isinstance(algorithm, str) or algorithm not in AGENTS:
+        raise UserError(
+            f"{path}: the agent {algorithm!r} is not known here, only {', '.join(AGENTS)}; "
+            "register yours with rtd.register_agent before you load it"
+        )
+    if memory not in MEMORIES:
+        raise UserError(
+            f"{path}: the memory {memory!r} is not known here, only {', '.join(MEMORIES)}; "
+            "register yours with rtd.register_memory before you load it"
+        )
+    acting = about.get("acting", "window")
+    if acting not in ACTINGS:
+        raise UserError(f"{wrong} acting is {acting!r}, not {' or '.join(ACTINGS)}")
+    windowed = AGENTS[algorithm].has_window
+    lowest = {"hidden_size": 1, "history_length": windowed}
+    for name, least in lowest.items():
+        if not _is_count(about.get(name), int(least)):
+            raise UserError(f"{wrong} {name} is {about.get(name)!r}")
+    interface = read_interface(path, about)
+    size = interface.action_size
+    centre_token = np.asarray(about.get("centre_token", np.zeros(size)), np.float32)
+    if centre_token.shape != (size,) or not np.all(np.isfinite(centre_token)):
+        raise UserError(f"{wrong} centre_token is not {size} numbers")
+    return interface, {
+        "format": about["format"],
+        "centre_token": centre_token,
+        "algorithm": algorithm,
+        "memory": memory,
+        "acting": acting,
+        "history_length": about["history_length"],
+        "width": about["hidden_size"],
+    }
+
+
+def read_interface(path: str | os.PathLike, about: Mapping[str, Any]) -> Interface:
+    """Sizes and bounds in a file's header, checked.
+
+    Raises:
+        UserError: when they are not such.
+    """
+    wrong = f"{path} is damaged: its header's"
+    if not _is_count(about.get("observation_size"), 1):
+        raise UserError(f"{wrong} observation_size is {about.get('observation_size')!r}")
+    shape = about.get("action_shape")
+    if not isinstance(shape, list) or not all(_is_count(n, 1) for n in shape):
+        raise UserError(f"{wrong} action_shape is {shape!r}")
+    size = math.prod(shape)
+    try:
+        low, high = (np.asarray(about[f"action_{e}"], np.float32) for e in ("low", "high"))
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{wrong} action bounds are not numbers") from error
+    fit = low.shape == high.shape == (size,) and np.all(np.isfinite([low, high]))
+    if not fit or not np.all(low < high):
+        raise UserError(f"{wrong} action bounds are not {size} pairs of low < high")
+    return Interface(about["observation_size"], tuple(shape), size, low, high)
+
+
+def _is_count(value: object, low: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and low <= value < 2**31

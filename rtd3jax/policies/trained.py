@@ -1,0 +1,260 @@
+"""A trained policy outside the trainer."""
+
+import os
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from rtd3jax.agents.agent import make_part
+from rtd3jax.agents.bounds import Bounds
+from rtd3jax.agents.history import Steps, empty_steps, present, put_step, window_at
+from rtd3jax.agents.memory.base import Carry, Params
+from rtd3jax.agents.networks import Network, act, advance
+from rtd3jax.errors import UserError
+from rtd3jax.policies.export.formats import writer_of
+from rtd3jax.policies.export.model import Model, fold
+from rtd3jax.registries import AGENTS
+from rtd3jax.system.files import array_bytes, check_target, flatten, write_new
+from rtd3jax.system.versions import versions_of
+
+FORMAT = 2
+"""Of saved policies; raised when older versions could not read them.
+
+Actors of format 1 read actions in the environment's units."""
+
+CARRY_FORMAT = 3
+"""Of saved policies that act with a running carry; else as `FORMAT`."""
+
+KIND = "policy"
+
+
+@struct.dataclass
+class PolicyState:
+    """What a policy remembers within an episode.
+
+    Attributes:
+        steps: ring of the last L steps; None where a carry runs on.
+        previous_action: [A], as tokens hold it; zero before the first step.
+        time: int32 [], steps done in the episode.
+        carry: the memory's, leaves [1, ...], where it runs on from the episode's start; else None.
+    """
+
+    steps: Steps | None
+    previous_action: jax.Array
+    time: jax.Array
+    carry: Carry | None = None
+
+
+@struct.dataclass
+class Policy:
+    """A deterministic actor with its window; jittable and vmappable.
+
+    Attributes:
+        actor: the actor's parameters.
+        bounds: the range of the environment's action.
+        history_length: int32 [], l.
+        centre_token: [A], what tokens hold for an action at the centre of its range: zero, but in
+            policies of format 1 the centre in half ranges.
+        algorithm: the agent's id.
+        tokens: past tokens in the window's arrays, at least l.
+        observation_size: O.
+        action_shape: shape of the environment's action.
+        memory: the name of its recurrent cell.
+        acting: ``window`` reads the last l steps at every step; ``carry`` goes on with the memory's
+            carry from the episode's start, which costs one token whatever l is.
+    """
+
+    actor: Params
+    bounds: Bounds
+    history_length: jax.Array
+    centre_token: jax.Array
+    algorithm: str = struct.field(pytree_node=False)
+    tokens: int = struct.field(pytree_node=False)
+    observation_size: int = struct.field(pytree_node=False)
+    action_shape: tuple[int, ...] = struct.field(pytree_node=False)
+    memory: str = struct.field(pytree_node=False, default="lstm")
+    acting: str = struct.field(pytree_node=False, default="window")
+
+    @property
+    def width(self) -> int:
+        """H."""
+        return int(self.actor["head"]["bias"].shape[-1])
+
+    @property
+    def network(self) -> Network:
+        """The actor as a module."""
+        sizes = self.observation_size, int(np.prod(self.action_shape, dtype=int))
+        return make_part(AGENTS[self.algorithm], "actor", self.memory, *sizes, self.width)
+
+    def init(self, key: jax.Array | None = None) -> PolicyState:
+        """The state before an episode's first step; ``key`` is not needed."""
+        action_size = self.bounds.low.shape[0]
+        runs_on = self.acting == "carry"
+        return PolicyState(
+            steps=None
+            if runs_on
+            else empty_steps(max(self.tokens, 1), self.observation_size, action_size),
+            previous_action=jnp.zeros((action_size,), jnp.float32),
+            time=jnp.int32(0),
+            carry=self.network.zero_carry(1) if runs_on else None,
+        )
+
+    def step(self, state: PolicyState, observation: jax.Array) -> tuple[jax.Array, PolicyState]:
+        """The action for ``observation`` [O], and the state that remembers both.
+
+        Outside `jax.jit` and `jax.vmap` it is compiled at the first call, and refuses readings that
+        are not finite. Where it is traced nothing can be refused: they are remembered.
+
+        Raises:
+            UserError: when the observation has another size than those the policy was trained on,
+                or is not finite; nothing is remembered of it then.
+        """
+        traced = any(
+            isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((self, state, observation))
+        )
+        if traced:
+            observation = jnp.asarray(observation, jnp.float32)
+            self._check_shape(observation.shape)
+            return self._step(state, observation)
+        with np.errstate(over="ignore"):
+            reading = np.asarray(observation, np.float32)
+        self._check_shape(reading.shape)
+        if not np.isfinite(reading).all():
+            raise UserError(
+                f"the observation {reading.tolist()} is not finite, and nothing was remembered of "
+                "it: step with the last good reading, or start the episode anew with policy.init()"
+            )
+        return _compiled_step(self, state, reading)
+
+    def _check_shape(self, shape: tuple[int, ...]) -> None:
+        expected = (self.observation_size,)
+        if shape == expected:
+            return
+        if len(shape) == 2 and shape[1:] == expected:
+            raise UserError(
+                f"the policy steps one plant, with observations of shape {expected}, not {shape}: "
+                "give observation[0], or for a batch use jax.vmap(policy.step) with one state for "
+                "each plant"
+            )
+        raise UserError(
+            f"the policy expects observations of shape {expected}, not {shape}: it was trained on "
+            "another environment"
+        )
+
+    def _step(self, state: PolicyState, observation: jax.Array) -> tuple[jax.Array, PolicyState]:
+        if state.steps is None:
+            return self._step_with_carry(state, observation)
+        time = state.time[None]
+        window = window_at(
+            state.steps,
+            time,
+            time,
+            state.time,
+            self.tokens,
+            self.history_length,
+            observation[None],
+            state.previous_action[None],
+        )
+        action = act(self.network, self.actor, window)[0]
+        token = action + self.centre_token
+        steps = put_step(state.steps, state.time, Steps(observation, state.previous_action, token))
+        state = PolicyState(steps, token, state.time + jnp.int32(1))
+        return self.bounds.to_environment(action).reshape(self.action_shape), state
+
+    def _step_with_carry(
+        self, state: PolicyState, observation: jax.Array
+    ) -> tuple[jax.Array, PolicyState]:
+        network, window = self.network, present(observation[None], state.previous_action[None])
+        action = act(network, self.actor, window, state.carry)[0]
+        token = action + self.centre_token
+        carry = state.carry
+        if carry is not None:
+            carry = advance(network, self.actor, window, token[None], carry)
+        state = PolicyState(None, token, state.time + jnp.int32(1), carry)
+        return self.bounds.to_environment(action).reshape(self.action_shape), state
+
+    def save(self, path: str | os.PathLike, overwrite: bool = False) -> None:
+        """Write the policy to a safetensors file, for `rtd3jax.load_policy`.
+
+        Raises:
+            UserError: when the file exists and ``overwrite`` is false, or cannot be written; when
+                weights are not finite; for a batch of policies.
+        """
+        check_target(path, overwrite)
+        write_new(path, array_bytes(flatten(self._actor()), self._about()), overwrite)
+
+    def export(self, path: str | os.PathLike, format: str, overwrite: bool = False) -> None:
+        """Write the policy in a form that runs without rtd3jax.
+
+        Args:
+            path: of the file.
+            format: ``onnx`` (needs the package onnx), ``stablehlo`` (needs flatbuffers; see
+                `rtd3jax.load_stablehlo`) or ``numpy`` (one Python file with a class ``Player``).
+            overwrite: replace a file that is there.
+
+        Raises:
+            UserError: as `save` does; for an unknown format; when its package is missing.
+        """
+        content_of = writer_of(format, str(path))
+        check_target(path, overwrite)
+        actor, reads = self._actor(), AGENTS[self.algorithm].actor
+        cell = self.memory if reads.memory else None
+        model = Model(
+            memory=reads.memory,
+            memory_has_current=reads.memory_has_current,
+            current=reads.current,
+            history_length=int(self.history_length),
+            observation_size=self.observation_size,
+            action_shape=self.action_shape,
+            arrays=fold(actor, cell, self.bounds.low, self.bounds.high, self.centre_token),
+            about=self._about(),
+            cell=cell,
+            network=self.network,
+            params=actor,
+            acting=self.acting,
+        )
+        write_new(path, content_of(model), overwrite)
+
+    def _actor(self) -> Params:
+        """The parameters on the host, checked."""
+        if self.history_length.ndim != 0:
+            raise UserError("this is a batch of policies; save or export them one by one")
+        actor = jax.tree.map(np.asarray, self.actor)
+        for name, array in flatten(actor).items():
+            if not np.all(np.isfinite(array)):
+                raise UserError(f"the policy's weights are not finite ({name}); it cannot be used")
+        return actor
+
+    def interface(self) -> dict[str, Any]:
+        """Sizes and bounds of the environment that it is for, as headers of files hold them."""
+        return {
+            "observation_size": self.observation_size,
+            "action_shape": list(self.action_shape),
+            "action_low": np.asarray(self.bounds.low).tolist(),
+            "action_high": np.asarray(self.bounds.high).tolist(),
+        }
+
+    def _about(self) -> dict[str, Any]:
+        """The header of a file that holds the policy."""
+        return {
+            "kind": KIND,
+            "format": CARRY_FORMAT if self.acting == "carry" else FORMAT,
+            "algorithm": self.algorithm,
+            "history_length": int(self.history_length),
+            **self.interface(),
+            "centre_token": np.asarray(self.centre_token).tolist(),
+            "hidden_size": self.width,
+            "memory": self.memory,
+            "acting": self.acting,
+            "versions": versions_of(("rtd3jax", "jax", "jaxlib", "numpy")),
+        }
+
+
+@jax.jit
+def _compiled_step(
+    policy: Policy, state: PolicyState, observation: jax.Array
+) -> tuple[jax.Array, PolicyState]:
+    return policy._step(state, observation)

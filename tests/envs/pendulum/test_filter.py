@@ -1,0 +1,80 @@
+"""The reference's belief is that of brute force, and what it earns is what such a belief allows."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rtd3jax as rtd
+from rtd3jax.envs.pendulum import filter as pendulum_filter
+from rtd3jax.envs.pendulum.belief import correct, predict, prior, sigma_points
+from rtd3jax.envs.pendulum.value_iteration import swing
+
+
+@pytest.fixture(autouse=True)
+def coarse_grid(monkeypatch):
+    monkeypatch.setattr(pendulum_filter, "ANGLES", 100)
+    monkeypatch.setattr(pendulum_filter, "SPEEDS", 80)
+
+
+def _posterior_moments(env, torques, observations):
+    """Mean and covariance of the state, by weighing a million starts: slow and obvious."""
+    angle, speed = np.meshgrid(
+        np.linspace(-np.pi, np.pi, 2_000, endpoint=False), np.linspace(-1, 1, 500), indexing="ij"
+    )
+    fit = 0.0
+    for step, seen in enumerate(np.asarray(observations)):
+        expected = (np.cos(angle), np.sin(angle), speed)
+        fit = fit - 2.0 * sum((o - e) ** 2 for o, e in zip(seen, expected, strict=True))
+        if step < len(torques):
+            params = env.default_params.env
+            angle, speed, _ = map(np.asarray, swing(params, angle, speed, torques[step]))
+    weight = np.exp(fit - fit.max()).ravel()
+    states = np.stack((np.cos(angle), np.sin(angle), speed), -1).reshape(-1, 3)
+    return np.average(states, axis=0, weights=weight), np.cov(states.T, aweights=weight)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("steps", [0, 8])
+def test_the_belief_is_the_posterior_of_a_million_starts(seed, steps):
+    env = rtd.make("pendulum", "noise")  # sigma 0.5: twice the squared distance is -log p
+    policy = rtd.filter_policy(env)
+    params = env.default_params.env
+    observation, state = env.reset(jax.random.key(seed))
+    seen, torques = [observation], np.random.default_rng(seed).uniform(-2, 2, steps)
+    belief = prior(policy.sensor, observation, *policy.cells)
+    belief = correct(belief, policy.sensor, policy.sensor.first, observation)
+    for step, torque in enumerate(torques):
+        action = jnp.asarray([torque], jnp.float32)
+        observation, state, *_ = env.step(jax.random.key(100 + step), state, action)
+        seen.append(observation)
+        belief = predict(belief, policy.sensor, params, jnp.float32(torque))
+        belief = correct(belief, policy.sensor, policy.sensor.later, observation)
+    weight, points = map(np.asarray, sigma_points(belief))
+    assert weight.sum() == pytest.approx(1, abs=1e-4)
+    states = np.stack((np.cos(points[:, 0]), np.sin(points[:, 0]), points[:, 1]), -1)
+    mean, covariance = _posterior_moments(env, torques, seen)
+    np.testing.assert_allclose(np.average(states, axis=0, weights=weight), mean, atol=0.06)
+    spread = np.sqrt(np.diag(np.cov(states.T, aweights=weight, ddof=0)))
+    np.testing.assert_allclose(spread, np.sqrt(np.diag(covariance)), rtol=0.25, atol=0.02)
+
+
+@pytest.mark.parametrize("disturbance", ["hidden", "random-sine", "temporal-sine"])
+def test_what_determines_the_state_costs_nothing(disturbance):
+    env, plain = rtd.make("pendulum", disturbance), rtd.make("pendulum")
+    returns = rtd.evaluate(rtd.filter_policy(env), env, 40)
+    known = rtd.evaluate(rtd.filter_policy(plain), plain, 40)
+    assert abs(float(jnp.mean(returns - known))) < 3.0
+
+
+def test_under_noise_it_earns_most_of_what_there_is():
+    env = rtd.make("pendulum", "noise")
+    returns = rtd.evaluate(rtd.filter_policy(env), env, 40, true_reward=True)
+    assert -350 < float(jnp.mean(returns)) < -150
+
+
+def test_other_worlds_are_refused_in_one_line():
+    with pytest.raises(rtd.UserError, match="pendulum alone"):
+        rtd.filter_policy(rtd.make("rover"))
+    with pytest.raises(rtd.UserError, match="does not cover Pulses"):
+        rtd.filter_policy(rtd.make("pendulum", "temporal-bias"))

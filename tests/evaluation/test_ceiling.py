@@ -1,0 +1,63 @@
+"""The rover's best policy: exact moments, exact inference, and nothing nearby does better."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+import rtd3jax as rtd
+from rtd3jax.envs.rover.optimum import clipped_normal_moments
+
+
+@pytest.mark.parametrize("mean", [0.0, 0.1, 0.25, 0.45, 0.5])
+@pytest.mark.parametrize("deviation", [0.02, 0.1, 0.4])
+def test_moments_equal_quadrature(mean, deviation):
+    grid = stats.norm.ppf((np.arange(200_000) + 0.5) / 200_000, mean, deviation).clip(0, 0.5)
+    got = clipped_normal_moments(*map(jnp.float32, (mean, deviation, 0.5)))
+    np.testing.assert_allclose(got, (grid.mean(), (grid**2).mean()), atol=2e-6)
+
+
+def test_the_slip_is_inferred_exactly():
+    env = rtd.make("rover", disturbance="ar1-slip")
+    policy = rtd.bayes_policy(env)
+    observation, state = env.reset(jax.random.key(3))
+    memory = policy.init()
+    for step in range(5):
+        met = state.slip.slip
+        action, memory = policy.step(memory, observation)
+        observation, state, *_ = env.step(jax.random.key(step), state, action)
+        _, after = policy.step(memory, observation)
+        np.testing.assert_allclose(after.slip, met, atol=1e-5)
+
+
+def test_without_slip_the_best_return_is_zero():
+    best = rtd.ceiling(rtd.make("rover"), episodes=4)
+    assert best.kind == "exact" and best.mean == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize("variant", ["ar1-slip", "ar1-slip-high-variance", "ar1-slip-slow"])
+def test_no_other_model_and_no_scaled_command_does_better(variant):
+    env = rtd.make("rover", disturbance=variant)
+    model = env.default_params.slip
+    best = rtd.evaluate(rtd.bayes_policy(env), env, episodes=2_000).mean()
+    wrong = dict(rho=model.rho - 0.05), dict(sigma=model.sigma * 2), dict(sigma=model.sigma / 3)
+    for change in wrong:
+        policy = rtd.bayes_policy(env, dataclasses.replace(model, **change))
+        assert rtd.evaluate(policy, env, episodes=2_000).mean() < best
+    constant = rtd.evaluate(rtd.constant_policy([0.5, 0.0]), env, episodes=2_000).mean()
+    assert constant < best - 1
+
+
+def test_the_sine_bound_is_named_as_one():
+    bound = rtd.ceiling(rtd.make("rover", disturbance="sine-slip"), episodes=2_000)
+    assert bound.kind == "upper bound" and -0.1 < bound.mean < 0
+
+
+def test_other_worlds_are_refused_in_one_line():
+    with pytest.raises(rtd.UserError, match="no ceiling of MountainCarContinuous-v0 is known"):
+        rtd.ceiling(rtd.make("MountainCarContinuous-v0"))
+    with pytest.raises(rtd.UserError, match="moments of SineSlip are not known"):
+        rtd.bayes_policy(rtd.make("rover", disturbance="sine-slip"))
