@@ -116,9 +116,16 @@ def _default_device() -> Any:
 
 
 def make_groups(
-    jobs: Sequence[Job], strategy: str, devices: int, at_once: int | None = None
+    jobs: Sequence[Job],
+    strategy: str,
+    devices: int,
+    at_once: int | None = None,
+    checkpoints: Checkpoints | None = None,
 ) -> list[Group]:
     """Groups of one lane (``map``), or one group per program and device (``vmap``).
+
+    With ``checkpoints``, only lanes that go on from the same step are grouped, so that one that is
+    new does not make the others start over.
 
     With ``at_once``, no more lanes than that are under way together, each device under ``vmap``:
     groups are split, and wait for those before them.
@@ -128,7 +135,8 @@ def make_groups(
         return [Group([job], wave=index // most) for index, job in enumerate(jobs)]
     by_program: dict[Any, list[Job]] = {}
     for job in jobs:
-        by_program.setdefault((job.program, _structure(job.lane)), []).append(job)
+        step = 0 if checkpoints is None else checkpoints.newest(job)
+        by_program.setdefault((job.program, _structure(job.lane), step), []).append(job)
     shares = [
         members[start::devices]
         for members in by_program.values()
