@@ -14,6 +14,7 @@ from rtd3jax.envs.disturbances import DampedSine, GaussianNoise, Hidden, Pulses,
 from rtd3jax.envs.disturbed import disturb
 from rtd3jax.envs.faults import Delay, Dropout, GainDrift, OrnsteinUhlenbeck, Quantisation
 from rtd3jax.envs.gymnasium_env import register_with_gymnasium, to_gymnasium
+from rtd3jax.envs.identity import ValueIdentity
 from rtd3jax.envs.process import Chain, Nothing, Process, Sum
 from rtd3jax.envs.registry import DISTURBANCES, ENVIRONMENTS, make, register
 from rtd3jax.errors import UserError
@@ -55,6 +56,7 @@ __all__ = [
     "Study",
     "Sum",
     "UserError",
+    "ValueIdentity",
     "Variant",
     "bayes_policy",
     "ceiling",

@@ -11,6 +11,7 @@ import dataclasses
 import gc
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -297,6 +298,28 @@ def _chunk(group: Group, device: Any, rates: dict[Any, float]) -> None:
     _advanced(group, state, stop)
 
 
+_COPIES = 3
+"""Programs that differ in nothing but the environment's object, from which on a warning says so."""
+
+
+def _warn_of_copies(program: Program) -> None:
+    """Warn, once, where a new environment object is made for each training."""
+    kind = type(program.env)
+    own = dataclasses.replace(program, env=None)
+    copies = {
+        id(other.env)
+        for other, *_ in _programs
+        if type(other.env) is kind and dataclasses.replace(other, env=None) == own
+    }
+    if kind.__eq__ is object.__eq__ and len(copies) + 1 == _COPIES:
+        warnings.warn(
+            f"{_COPIES} programs of {kind.__name__} differ only in the environment's object, and "
+            "each costs its compilation and some 100 MiB: use one object, or inherit "
+            "rtd.ValueIdentity, which says when two are equal",
+            stacklevel=2,
+        )
+
+
 class _Compiled:
     """The executables of one program, compiled by whoever needs them first."""
 
@@ -322,6 +345,8 @@ def _compiled(program: Program, lane: Lane, batched: bool, device: Any) -> tuple
     if key not in _programs:
         make_room()
     with _programs_lock:
+        if key not in _programs:
+            _warn_of_copies(program)
         entry = _programs.setdefault(key, _Compiled())
     with entry.lock:
         if entry.executables is None:
