@@ -12,6 +12,7 @@ from rtd3jax.envs.check import Finding, check_env, find_problems
 from rtd3jax.envs.compat.brax import from_brax
 from rtd3jax.envs.compat.gymnasium import register_with_gymnasium, to_gymnasium
 from rtd3jax.envs.disturbed import disturb
+from rtd3jax.envs.identity import ValueIdentity
 from rtd3jax.envs.pendulum.filter import filter_policy
 from rtd3jax.envs.processes.disturbances import DampedSine, GaussianNoise, Hidden, Pulses, Sine
 from rtd3jax.envs.processes.faults import Delay, Dropout, GainDrift, OrnsteinUhlenbeck, Quantisation
@@ -60,6 +61,7 @@ __all__ = [
     "Study",
     "Sum",
     "UserError",
+    "ValueIdentity",
     "Variant",
     "bayes_policy",
     "ceiling",

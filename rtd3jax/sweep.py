@@ -1,7 +1,7 @@
 """``python -m rtd3jax.sweep``: train every cell of a study, and write down what came out.
 
 A cell is an algorithm under a disturbance with a history length; its seeds are trained side by
-side. The same command again trains what is missing.
+side. The same command again trains what is missing; with more seeds, cells or steps, those too.
 """
 
 import argparse
@@ -25,7 +25,7 @@ from rtd3jax.study.hosts import own_shard, own_share, relaunch
 from rtd3jax.study.lock import parse_shard, writer
 from rtd3jax.study.loggers import check_loggers, open_loggers
 from rtd3jax.study.memory import lanes_at_once, memory
-from rtd3jax.study.plan import cell_jobs, make_cells, plan_text
+from rtd3jax.study.plan import make_cells, plan_text
 from rtd3jax.study.references import references_of
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.training.lanes import Job, workers
@@ -84,21 +84,34 @@ def _run(options: argparse.Namespace) -> int:
     check_loggers(options.log)
     if sum(map(bool, (options.shard, options.distributed, options.cluster))) > 1:
         raise UserError("--shard, --distributed and --cluster each share out the lanes: choose one")
-    jobs = cell_jobs(cells, seeds, strategy)
+    out = given.out(options)
+    directory = RunDirectory(out, cells, seeds, episodes, prepare=False)
+    news = "" if options.fresh else directory.plan()
+    jobs = directory.jobs(strategy)
     if options.dry_run:
-        print(plan_text(cells, seeds, jobs, strategy, memory()))
+        print(plan_text(directory.cells, directory.seeds, jobs, strategy, memory()))
+        print(news, end="\n" if news else "")
         return 0
     # On a cluster its nodes, not this machine, must have the memory.
     fit = len(jobs) if options.cluster else None
     at_once = fit or lanes_at_once(jobs, strategy, len(workers()), memory())
     interval = given.parse_interval(options.checkpoint_every)
-    out = given.out(options)
     shard = _shard(options)
     if options.fresh:
         _set_aside(out)
-    directory = RunDirectory(out, cells, seeds, episodes)
-    work = Work(strategy, at_once, interval, quiet=options.quiet, page=options.report)
+    if news := directory.prepare():
+        print(news)
+    work = Work(
+        strategy,
+        at_once,
+        interval,
+        quiet=options.quiet,
+        page=options.report,
+        keep=options.keep_checkpoints,
+    )
     with writer(directory.path, shard):
+        if directory.refresh():  # another process was quicker
+            jobs = directory.jobs(strategy)
         return _train(directory, _share(jobs, shard, options), work, options)
 
 

@@ -43,11 +43,13 @@ class Finding:
             ``finite``, ``pure``, ``leak``, ``final-observation``, ``time-limit``.
         problem: what was seen.
         remedy: what to do.
+        advice: whether the environment is sound and yet likely to be learned badly.
     """
 
     kind: str
     problem: str
     remedy: str
+    advice: bool = False
 
     def __str__(self) -> str:
         """The problem and its remedy."""
@@ -58,7 +60,7 @@ def check_env(env: EnvironmentLike, *, params: object = None, seed: int = 0) -> 
     """Play ``env`` with random actions, and raise if anything is wrong with it.
 
     Eight episodes are played to their end, for at most 1,000 steps; the environment is compiled for
-    it.
+    it. What is sound and yet likely to be learned badly is a warning.
 
     Args:
         env: a gymnax >= 1.0 environment.
@@ -69,10 +71,13 @@ def check_env(env: EnvironmentLike, *, params: object = None, seed: int = 0) -> 
         UserError: one that lists every `Finding` with its remedy, on lines of their own if there
             are several.
     """
-    findings = find_problems(env, params=params, seed=seed)
+    found, name = _findings(env, params, seed), environment_name(env)
+    for finding in found:
+        if finding.advice:
+            warnings.warn(f"environment {name}: {finding}", stacklevel=2)
+    findings = [finding for finding in found if not finding.advice]
     if findings:
         lines = [str(finding) for finding in findings]
-        name = environment_name(env)
         if len(lines) == 1:
             kind_of_prefix = f"environment {name}"
             line = lines[0]
@@ -87,6 +92,11 @@ def check_env(env: EnvironmentLike, *, params: object = None, seed: int = 0) -> 
 
 def find_problems(env: EnvironmentLike, *, params: object = None, seed: int = 0) -> list[Finding]:
     """What `check_env` would raise, as a list; empty for a sound environment."""
+    return [finding for finding in _findings(env, params, seed) if not finding.advice]
+
+
+def _findings(env: Any, params: Any, seed: int) -> list[Finding]:
+    """All findings, advice included."""
     try:
         params = parameters_of(env, params)
     except UserError as error:
@@ -299,6 +309,15 @@ def _time_limits(record: _Record, limit: int | None, steps: int) -> Iterator[Fin
             "time-limit",
             f"an episode goes on after params.max_steps_in_episode = {longest} steps",
             "count the steps in state.time, which gymnax's is_truncated reads",
+        )
+    elif (record.length == 1).all() and not terminated.any():
+        yield Finding(
+            "time-limit",
+            f"a time limit ends all {EPISODES} episodes at their first step",
+            "memories are then never trained on a second step, and the value of what follows may "
+            "run away: report the end as terminated if nothing follows it, or let episodes be "
+            "longer, or train td3, or with gamma=0",
+            advice=True,
         )
 
 

@@ -29,7 +29,7 @@ from rtd3jax.study.early import EarlyAnswers
 from rtd3jax.study.execute import Work, train_here, waiting_jobs
 from rtd3jax.study.loggers import Logger
 from rtd3jax.study.memory import job_bytes, lanes_at_once, memory
-from rtd3jax.study.plan import Cell, cell_jobs, label
+from rtd3jax.study.plan import Cell, label
 from rtd3jax.study.rundir import (
     LOG,
     PACKAGES,
@@ -248,7 +248,7 @@ def _train_cell(
     directory = RunDirectory.open(path)
     cell = directory.cells[index]
     # All cells, because side by side they share a program as wide as the longest window.
-    jobs = cell_jobs(directory.cells, directory.seeds, work.strategy)
+    jobs = directory.jobs(work.strategy)
     own = [job for job in jobs if job.owner[0] == cell and job.owner[1] in seeds]
     complaints: list[str] = []
     kept = [checkpoint_steps(directory.checkpoint_directory(cell, seed)) for seed in seeds]

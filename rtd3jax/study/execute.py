@@ -25,6 +25,7 @@ class Work:
         quiet: no progress bar, no remarks.
         page: whether the run's page is written.
         workers: as many as this at most; all that there are by default.
+        keep: whether a lane's last checkpoint stays when it ends, for more steps later.
     """
 
     strategy: str
@@ -33,6 +34,7 @@ class Work:
     quiet: bool = False
     page: bool = True
     workers: int | None = None
+    keep: bool = False
 
 
 def train_here(
@@ -53,10 +55,10 @@ def train_here(
     if work.at_once < len(waiting) and not work.quiet:
         print(f"memory for {work.at_once:,} lanes at once: the others wait for their turn")
     devices = workers()[: work.workers]
-    groups = make_groups(waiting, work.strategy, len(devices), work.at_once)
     checkpoints = checkpoints_of(directory, work.interval)
+    groups = make_groups(waiting, work.strategy, len(devices), work.at_once, checkpoints)
     early = None if references is None else EarlyAnswers(directory, references, page=work.page)
-    recorder = Recorder(directory, checkpoints, early, logger, complaints)
+    recorder = Recorder(directory, checkpoints, early, logger, complaints, keep=work.keep)
     with Progress(groups, label, enabled=not work.quiet) as bar:
 
         def on_chunk(group: Group) -> None:

@@ -80,6 +80,11 @@ def parser(description: str | None) -> argparse.ArgumentParser:
         metavar="T",
         help="300s, 5m, 1h or 2000steps [five minutes, or longer where it would cost above 2%%]",
     )
+    work.add_argument(
+        "--keep-checkpoints",
+        action="store_true",
+        help="a lane's last checkpoint stays when it ends: more --total-steps later go on from it",
+    )
     work.add_argument("--dry-run", action="store_true", help="print the plan and its cost")
     work.add_argument(
         "--log",

@@ -96,23 +96,39 @@ def make_cells(grids: Iterable[Grid], overrides: dict[str, Any]) -> list[Cell]:
     return list(cells)
 
 
-def cell_jobs(cells: Sequence[Cell], seeds: Sequence[int], strategy: str) -> list[Job]:
+def cell_jobs(
+    cells: Sequence[Cell], seeds: Sequence[int], strategy: str, stages: Sequence[int] = ()
+) -> list[Job]:
     """A job per cell and seed, owned by ``(cell, seed)``.
 
     Side by side (``vmap``), all history lengths in a world share the longest one's program: there a
     wider product is nearly free. One by one (``map``), each length has a program of its own.
+
+    Args:
+        cells: of the study.
+        seeds: of each cell.
+        strategy: ``map`` or ``vmap``.
+        stages: how many cells there were before each time that cells were added to the study. A
+            longer window that comes later does not change the program of those before it.
     """
-    longest: dict[str, int] = {}
-    if strategy == "vmap":
-        for cell in cells:
-            longest[cell.env] = max(longest.get(cell.env, 0), cell.config.tokens)
+    windows = _windows(cells, stages) if strategy == "vmap" else [None] * len(cells)
     return [
         job
-        for cell in cells
-        for job in make_jobs(
-            cell.make_env(), cell.config, seeds, cell=cell, window=longest.get(cell.env)
-        )
+        for cell, window in zip(cells, windows, strict=True)
+        for job in make_jobs(cell.make_env(), cell.config, seeds, cell=cell, window=window)
     ]
+
+
+def _windows(cells: Sequence[Cell], stages: Sequence[int]) -> list[int]:
+    """Of each cell, the longest window in its world among the cells up to its own stage."""
+    longest: dict[str, int] = {}
+    found: list[int] = []
+    for end in (*stages, len(cells)):
+        stage = cells[len(found) : end]
+        for cell in stage:
+            longest[cell.env] = max(longest.get(cell.env, 0), cell.config.tokens)
+        found += [longest[cell.env] for cell in stage]
+    return found
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,6 +13,7 @@ from rtd3jax.study.plan import label
 from rtd3jax.study.rundir import LOG, RunDirectory
 from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.lanes import Group, Job
+from rtd3jax.training.loop import HEALTHY
 from rtd3jax.training.run import curves_of, evaluation_steps, failure_of, metric_curves
 
 
@@ -26,8 +27,13 @@ class Recorder:
         early: EarlyAnswers | None,
         logger: Logger | None,
         complaints: list[str],
+        *,
+        keep: bool = False,
     ):
-        """Without ``early``, tables and page are left to whoever started this process."""
+        """Without ``early``, tables and page are left to whoever started this process.
+
+        With ``keep``, a lane's last checkpoint stays when it ends.
+        """
         self._directory = directory
         self._checkpoints = checkpoints
         self._early = early
@@ -36,6 +42,7 @@ class Recorder:
         self._there = directory.repair_log()
         self._began = time.perf_counter()
         self._complaints = complaints
+        self._keep_checkpoints = keep
 
     def update(self, group: Group) -> None:
         """Take note of a chunk that ``group`` has done, of its end, or of its error."""
@@ -50,8 +57,12 @@ class Recorder:
         # An event may be read late, after the one that already kept the group.
         if group.finished and group.state is not None:
             for job, state in group.lanes():
+                stays = self._keep_checkpoints and int(state.failure) == HEALTHY
+                if stays:  # first, so that no lane is there without it
+                    self._checkpoints.save([(job, state)], group, group.step, kept=1)
                 self._keep(job, state)
-                self._checkpoints.discard(job)
+                if not stays:
+                    self._checkpoints.discard(job)
             group.state = None  # its replay is no longer needed
             if self._early is not None:
                 self._early.refresh()

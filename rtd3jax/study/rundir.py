@@ -9,6 +9,7 @@ import dataclasses
 import json
 import platform
 import re
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,8 +22,16 @@ from rtd3jax.errors import UserError
 from rtd3jax.policies.serialization import read_interface, restore_policy
 from rtd3jax.policies.trained import FORMAT, Policy
 from rtd3jax.study.ceilings import ceilings_of
+from rtd3jax.study.contents import (
+    Contents,
+    cell_words,
+    grown,
+    longer_cells,
+    read_config,
+    what_was_added,
+)
 from rtd3jax.study.figures import final_returns, learning_curves
-from rtd3jax.study.lock import deriver, is_held
+from rtd3jax.study.lock import deriver, is_held, writer
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.results import (
     CELL,
@@ -36,18 +45,22 @@ from rtd3jax.study.results import (
 from rtd3jax.study.summary import summary_markdown
 from rtd3jax.system.files import (
     flatten,
+    read_about,
     read_arrays,
     user_path,
     write_arrays,
     write_bytes_atomically,
 )
 from rtd3jax.system.versions import versions_of
-from rtd3jax.training.checkpoint import checkpoint_steps
-from rtd3jax.training.run import check_seeds
+from rtd3jax.training.checkpoint import checkpoint_steps, why_not_longer
+from rtd3jax.training.lanes import Job
 
 _CURVE_ARRAYS = ("steps", "returns", "true_returns")
 _FINAL_ARRAYS = ("final_returns", "final_true_returns")
+CONFIG = "config.json"
 LOG = "log.jsonl"
+_PATIENCE, _PATIENCE_SECONDS = 10, 0.1
+"""How often, and how long, a shard waits for another one that lets the study grow."""
 PACKAGES = ("rtd3jax", "jax", "jaxlib", "flax", "optax", "gymnax", "numpy")
 
 
@@ -65,8 +78,11 @@ class Reference:
 class RunDirectory:
     """The directory of one sweep.
 
+    What is there already is gone on with, and grows by what is asked for besides.
+
     Raises:
-        UserError: when it holds another study, or cannot be written.
+        UserError: when a lane that is there would become another one, or when the directory cannot
+            be written.
     """
 
     def __init__(
@@ -79,57 +95,141 @@ class RunDirectory:
         prepare: bool = True,
     ):
         self.path = user_path(path)
-        self.cells = list(cells)
-        self.seeds = list(seeds)
-        self.episodes = episodes
-        self._study = {
-            "cells": [cell.to_dict() for cell in cells],
-            "seeds": list(seeds),
-            "final_episodes": episodes,
-        }
+        self._asked = self.contents = Contents(tuple(cells), tuple(seeds), episodes)
         if prepare:
-            self._prepare()
+            self.prepare()
 
     @classmethod
     def open(cls, path: str | Path) -> "RunDirectory":
         """The study that is in ``path`` already."""
-        study = _read_study(user_path(path) / "config.json")
-        try:
-            cells = [Cell.from_dict(dict(cell)) for cell in study["cells"]]
-            seeds, episodes = check_seeds(study["seeds"]), int(study["final_episodes"])
-        except (KeyError, TypeError, ValueError) as error:
-            raise UserError(f"{path}/config.json is not a study's configuration") from error
-        return cls(path, cells, seeds, episodes, prepare=False)
+        there = Contents.read(user_path(path) / CONFIG)
+        directory = cls(path, there.cells, there.seeds, there.episodes, prepare=False)
+        directory.contents = there
+        return directory
 
-    def _prepare(self) -> None:
-        """Make the directory, or see that it holds this study."""
-        config = self.path / "config.json"
+    @property
+    def cells(self) -> list[Cell]:
+        """All cells, also those that were not asked for now."""
+        return list(self.contents.cells)
+
+    @property
+    def seeds(self) -> list[int]:
+        """Of each cell's lanes."""
+        return list(self.contents.seeds)
+
+    @property
+    def episodes(self) -> int:
+        """Of the final evaluation of a lane."""
+        return self.contents.episodes
+
+    def jobs(self, strategy: str) -> list[Job]:
+        """A job for each lane."""
+        return self.contents.jobs(strategy)
+
+    def plan(self) -> str:
+        """Find what the study will consist of; nothing is written.
+
+        Returns:
+            What is new in it, or that more is there than was asked for; for people, mostly empty.
+        """
+        config = self.path / CONFIG
+        if not config.exists():
+            return ""
+        there = Contents.read(config)
+        try:
+            self.contents = grown(there, self._asked)
+        except UserError as error:
+            raise UserError(
+                f"--out {self.path} holds another study ({error}); "
+                "choose another directory, or remove that one"
+            ) from error
+        self._check_longer(there)
+        self._check_format(config)
+        if self.contents != there:
+            return f"added to {self.path}: {what_was_added(there, self.contents)}"
+        if grown(self._asked, there) != self._asked:
+            return (
+                f"{self.path} holds more than was asked for: all of its {len(there.cells)} cells "
+                f"× {len(there.seeds)} seeds go on"
+            )
+        return ""
+
+    def prepare(self) -> str:
+        """Make the directory, or let the study that is there grow; what `plan` says.
+
+        It is safe at any moment: the configuration is replaced as a whole, and grows only while no
+        process writes to the directory.
+        """
+        config = self.path / CONFIG
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             if config.exists():
-                self._check_same(config)
-                self._check_format(config)
-                return
+                return self._grow(config)
             if not all(map(_is_own, self.path.iterdir())):
                 raise UserError(
                     f"--out {self.path} is not empty and holds no study; choose another directory"
                 )
-            content = {"format": FORMAT, "study": self._study, "made_with": _made_with()}
-            write_bytes_atomically(config, (json.dumps(content, indent=1) + "\n").encode())
+            study = self.contents.to_dict()
+            _write_config(config, {"format": FORMAT, "study": study, "made_with": _made_with()})
         except OSError as error:
             raise UserError(f"--out {self.path} cannot be written: {error.strerror}") from error
+        return ""
 
-    def _check_same(self, config: Path) -> None:
-        study = _with_defaults(_read_study(config))
-        if study != json.loads(json.dumps(self._study)):
-            raise UserError(
-                f"--out {self.path} holds another study ({_difference(study, self._study)}); "
-                "choose another directory, or remove that one"
-            )
+    def _grow(self, config: Path) -> str:
+        for last in (*[False] * _PATIENCE, True):
+            news = self.plan()
+            if not Contents.read(config).lacks(self._asked):
+                return news
+            try:
+                with writer(self.path, None):
+                    news, content = self.plan(), read_config(config)
+                    change = {"added": what_was_added(Contents.read(config), self.contents)}
+                    if change["added"]:
+                        made = {**change, "made_with": _made_with()}
+                        content["grown"] = [*content.get("grown", []), made]
+                        content["study"] = self.contents.to_dict()
+                        _write_config(config, content)
+                    return news
+            except UserError:
+                # Perhaps another shard of the same command is letting it grow just now.
+                if last:
+                    raise
+                time.sleep(_PATIENCE_SECONDS)
+        raise AssertionError("the last try returns or raises")
+
+    def refresh(self) -> bool:
+        """See what another process has added; whether there is something."""
+        before = self.contents
+        self.plan()
+        return self.contents != before
+
+    def _check_longer(self, there: Contents) -> None:
+        """More steps must be able to go on where lanes are."""
+        for before, after in longer_cells(there, self.contents):
+            steps = after.config.total_steps
+            ended = 0
+            for seed in there.seeds:
+                kept = checkpoint_steps(self.checkpoint_directory(before, seed))
+                if self.is_done(before, seed) and not kept and not self._is_lost(before, seed):
+                    ended += 1
+                elif kept:
+                    reason = why_not_longer(before.to_dict(), after.to_dict(), max(kept))
+                    if reason is not None:
+                        raise UserError(
+                            f"--out {self.path}: {cell_words(after)} cannot go on to {steps:,} "
+                            f"steps: {reason}; choose another directory"
+                        )
+            if ended:
+                raise UserError(
+                    f"--out {self.path}: {cell_words(after)} cannot go on to {steps:,} steps: "
+                    f"{ended} of its lanes ended at {before.config.total_steps:,} and kept no "
+                    "checkpoint (--keep-checkpoints keeps them); choose another directory, or "
+                    f"remove {self.path / 'lanes' / cell_name(after)} to train them from the start"
+                )
 
     def _check_format(self, config: Path) -> None:
         """Do not train further lanes beside those whose agents read actions in other units."""
-        if json.loads(config.read_text("utf-8")).get("format", 1) == FORMAT or self.has_ended():
+        if read_config(config).get("format", 1) == FORMAT or self.has_ended():
             return
         for cell in self.cells:
             env = cell.make_env()
@@ -165,8 +265,21 @@ class RunDirectory:
         return self.lane_path(cell, seed).with_suffix(".error.txt")
 
     def is_done(self, cell: Cell, seed: int) -> bool:
-        """Whether the lane was trained to its end."""
-        return self.lane_path(cell, seed).exists()
+        """Whether the lane was trained to its end, be it lost; with more steps later, to that."""
+        path = self.lane_path(cell, seed)
+        if not path.exists():
+            return False
+        try:
+            about = read_about(path)
+            return about["cell"]["total_steps"] == cell.config.total_steps or self._is_lost(
+                cell, seed
+            )
+        except (UserError, KeyError, TypeError):
+            return True  # whoever reads it says what is wrong with it
+
+    def _is_lost(self, cell: Cell, seed: int) -> bool:
+        """Whether the lane, which has a file, was lost in training."""
+        return read_about(self.lane_path(cell, seed))["failure"] is not None
 
     def has_ended(self) -> bool:
         """Whether no lane is left to train: each is done, or was lost, or failed."""
@@ -363,7 +476,7 @@ class RunDirectory:
         return {
             "cells": len(self.cells),
             "seeds": len(self.seeds),
-            "final episodes per seed": self._study["final_episodes"],
+            "final episodes per seed": self.episodes,
             **fields,
         }
 
@@ -390,22 +503,8 @@ def _is_own(entry: Path) -> bool:
     return entry.name.startswith(".lock") or half_written
 
 
-def _read_study(config: Path) -> Any:
-    try:
-        return json.loads(config.read_text("utf-8"))["study"]
-    except OSError as error:
-        raise UserError(f"there is no study in {config.parent} ({error.strerror})") from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{config} is not a study's configuration") from error
-
-
-def _with_defaults(study: Any) -> Any:
-    """``study``, a field of the configuration that it was written without at its default."""
-    try:
-        cells = [Cell.from_dict(dict(cell)).to_dict() for cell in study["cells"]]
-    except (UserError, KeyError, TypeError, ValueError):
-        return study  # it is another study then, and the difference is named
-    return {**study, "cells": cells}
+def _write_config(path: Path, content: Any) -> None:
+    write_bytes_atomically(path, (json.dumps(content, indent=1) + "\n").encode())
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:
@@ -471,18 +570,3 @@ def _made_with() -> dict[str, Any]:
         "devices": len(jax.local_devices()),
         "machine": platform.machine(),
     }
-
-
-def _difference(old: Any, new: Any) -> str:
-    """The first thing in which two studies differ, in words."""
-    for name in ("seeds", "final_episodes"):
-        if old.get(name) != new[name]:
-            return f"{name}: {old.get(name)} there, {new[name]} here"
-    before, after = old.get("cells", []), json.loads(json.dumps(new["cells"]))
-    if len(before) != len(after):
-        return f"{len(before)} cells there, {len(after)} here"
-    for one, other in zip(before, after, strict=True):
-        for name in other:
-            if one.get(name) != other[name]:
-                return f"{name}: {one.get(name)} there, {other[name]} here"
-    return "another format"

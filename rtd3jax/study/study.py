@@ -24,11 +24,11 @@ from rtd3jax.study.finish import finish
 from rtd3jax.study.lock import writer
 from rtd3jax.study.loggers import check_loggers, open_loggers
 from rtd3jax.study.memory import lanes_at_once, memory
-from rtd3jax.study.plan import Cell, cell_jobs
+from rtd3jax.study.plan import Cell
 from rtd3jax.study.references import references_of
 from rtd3jax.study.report.page import write_page
 from rtd3jax.study.results import CURVES, EPISODES, METRICS, read_table
-from rtd3jax.study.rundir import RunDirectory
+from rtd3jax.study.rundir import CONFIG, RunDirectory
 from rtd3jax.system.files import user_path
 from rtd3jax.training.lanes import workers
 from rtd3jax.training.run import check_seeds, check_strategy
@@ -40,12 +40,13 @@ class Study:
     Args:
         cells: what is trained: an environment, a disturbance and a configuration each.
         seeds: of each cell's lanes.
-        out: the run directory. A study that is there already is gone on with.
+        out: the run directory. A study that is there already is gone on with; what is asked for
+            besides (seeds, cells, more steps of a cell) is added by `run`.
         final_episodes: of the evaluation at a lane's end.
 
     Raises:
-        UserError: when two cells cannot be told apart in the tables, when ``out`` holds another
-            study, or when it cannot be written.
+        UserError: when two cells cannot be told apart in the tables, when a lane that is in
+            ``out`` would become another one, or when it cannot be written.
     """
 
     def __init__(
@@ -56,10 +57,14 @@ class Study:
         out: str | os.PathLike,
         final_episodes: int = 20,
     ) -> None:
-        self._cells = _distinct(cells)
-        self._directory = RunDirectory(
-            user_path(out), self._cells, check_seeds(seeds), final_episodes
+        directory = RunDirectory(
+            user_path(out), _distinct(cells), check_seeds(seeds), final_episodes, prepare=False
         )
+        if (directory.path / CONFIG).exists():
+            directory.plan()  # to look at a study does not let it grow
+        else:
+            directory.prepare()
+        self._directory = directory
 
     @property
     def path(self) -> Path:
@@ -74,6 +79,7 @@ class Study:
         log: Sequence[str] = (),
         strategy: str | None = None,
         checkpoint_seconds: float | None = None,
+        keep_checkpoints: bool = False,
     ) -> list[str]:
         """Train the lanes that are missing, then write tables, pictures and the page.
 
@@ -83,18 +89,24 @@ class Study:
             log: trackers: ``tensorboard``, ``wandb``, ``mlflow``.
             strategy: ``map`` or ``vmap``; by default what suits the backend.
             checkpoint_seconds: between checkpoints of a lane; by default as the sweep's.
+            keep_checkpoints: whether a lane's last checkpoint stays when it ends, so that it can be
+                given more steps later.
 
         Returns:
             A line for each lane that was lost or failed.
         """
         directory, strategy = self._directory, check_strategy(strategy)
         check_loggers(log)
-        jobs = cell_jobs(directory.cells, directory.seeds, strategy)
-        at_once = lanes_at_once(jobs, strategy, len(workers()), memory())
-        work = Work(strategy, at_once, (checkpoint_seconds, None), quiet=quiet, page=page)
+        if news := directory.prepare():
+            print(news)
         complaints: list[str] = []
-        references = references_of(directory.cells)
         with writer(directory.path, None):
+            directory.refresh()
+            jobs = directory.jobs(strategy)
+            at_once = lanes_at_once(jobs, strategy, len(workers()), memory())
+            interval = (checkpoint_seconds, None)
+            work = Work(strategy, at_once, interval, quiet=quiet, page=page, keep=keep_checkpoints)
+            references = references_of(directory.cells)
             ended = False
             try:
                 with open_loggers(log, directory) as logger:

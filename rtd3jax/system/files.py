@@ -117,6 +117,19 @@ def read_arrays(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], Any]:
     return arrays, about
 
 
+def read_about(path: str | os.PathLike) -> Any:
+    """What `write_arrays` was told about the arrays; these are not read, and nothing is checked.
+
+    Raises:
+        UserError: when the file is missing or something else.
+    """
+    try:
+        with safe_open(user_path(path), "numpy") as file:
+            return json.loads((file.metadata() or {})[_ENTRY])["about"]
+    except (OSError, SafetensorError, KeyError, ValueError, TypeError) as error:
+        raise UserError(f"{path} cannot be read ({first_line(error)})") from error
+
+
 def flatten(tree: object, prefix: str = "") -> dict[str, np.ndarray]:
     """A nested dict's arrays under dotted names."""
     if not isinstance(tree, dict):

@@ -9,7 +9,7 @@ is immaterial, so a lane that goes on from a checkpoint ends with the same bits.
 import re
 import time
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,8 @@ _PATIENCE = 150
 cores they cost 2% at most, however large the replay."""
 
 KEPT = 2
+LONGER = ("total_steps", "replay_capacity")
+"""Fields of the configuration that may grow, and a lane goes on from its checkpoint."""
 _FORMAT = 1
 
 
@@ -68,8 +70,10 @@ class Checkpoints:
         by_time = now - when >= seconds
         return by_time or (self._steps is not None and group.step - step >= self._steps)
 
-    def save(self, jobs: Iterable[tuple[Any, LaneState]], group: Any, step: int) -> None:
-        """Write a checkpoint of each lane at ``step``, then drop those before the last two."""
+    def save(
+        self, jobs: Iterable[tuple[Any, LaneState]], group: Any, step: int, kept: int = KEPT
+    ) -> None:
+        """Write a checkpoint of each lane at ``step``, then drop those before the last ``kept``."""
         began = time.monotonic()
         for job, state in jobs:
             directory = self._directory_of(job)
@@ -87,7 +91,7 @@ class Checkpoints:
                     f"checkpoint in {directory} cannot be written: {error.strerror}; "
                     "the one before it is kept"
                 ) from error
-            for old in [*_files(directory)[KEPT:], *_unfinished(directory)]:
+            for old in [*_files(directory)[kept:], *_unfinished(directory)]:
                 old.unlink(missing_ok=True)
         now = time.monotonic()
         self._written[id(group)] = (now, step)
@@ -112,6 +116,10 @@ class Checkpoints:
         step = max(common)
         return [steps[step] for steps in found], step
 
+    def newest(self, job: Any) -> int:
+        """The step of a lane's newest checkpoint, sound or not; 0 without one."""
+        return max(checkpoint_steps(self._directory_of(job)), default=0)
+
     def discard(self, job: Any) -> None:
         """Remove a lane's checkpoints: it has ended, and its result is kept."""
         directory = self._directory_of(job)
@@ -129,7 +137,9 @@ class Checkpoints:
             except UserError as error:
                 complaints.append(str(error))
                 continue
-            self._check(file, about, job)
+            longer = self._check(file, about, job)
+            if longer:
+                arrays = _extended(arrays, job.program, job.lane)
             states[int(about["step"])] = from_arrays(arrays, job.program, job.lane, file)
             if first:
                 break
@@ -142,19 +152,66 @@ class Checkpoints:
             warnings.warn(f"{complaint}; an older checkpoint is used", stacklevel=2)
         return states
 
-    def _check(self, file: Path, about: Any, job: Any) -> None:
-        here = {
+    def _check(self, file: Path, about: Any, job: Any) -> bool:
+        """See that a checkpoint is of this lane; whether the lane has more steps now."""
+        here: dict[str, Any] = {
             "format": _FORMAT,
             "identity": self._identity_of(job),
             "versions": versions(),
         }
+        there = about if isinstance(about, dict) else {}
+        longer = is_longer(there.get("identity"), here["identity"])
+        if longer:
+            reason = why_not_longer(there["identity"], here["identity"], int(there["step"]))
+            if reason is not None:
+                raise UserError(f"{file} cannot go on to more steps: {reason}; start over")
+            del here["identity"]
         for name, value in here.items():
-            there = about.get(name) if isinstance(about, dict) else None
-            if there != value:
+            if there.get(name) != value:
                 raise UserError(
-                    f"{file} is of another {name} ({_difference(there, value)}); "
+                    f"{file} is of another {name} ({_difference(there.get(name), value)}); "
                     "use what made it, or start over"
                 )
+        return longer
+
+
+def is_longer(before: Any, after: Mapping[str, Any]) -> bool:
+    """Whether ``after`` (a lane's identity) is ``before`` with more steps."""
+    if not isinstance(before, dict) or before.keys() != after.keys():
+        return False
+    changed = {name for name in after if before[name] != after[name]}
+    return (
+        "total_steps" in changed
+        and changed <= set(LONGER)
+        and before["total_steps"] < after["total_steps"]
+    )
+
+
+def why_not_longer(before: Mapping[str, Any], after: Mapping[str, Any], step: int) -> str | None:
+    """Why a lane that did ``step`` steps cannot go on as if it had been meant to do more.
+
+    Args:
+        before: the configuration with which it did them.
+        after: the configuration with more steps.
+        step: steps done.
+
+    Returns:
+        The reason, with the field that it is about; None where it can go on, to the bit.
+    """
+    fraction, slots = before["final_learning_rate_fraction"], before["replay_capacity"]
+    if fraction != 1.0:
+        return (
+            f"its learning rates have been falling towards step {before['total_steps']:,} "
+            f"(final_learning_rate_fraction: {fraction})"
+        )
+    if slots != after["replay_capacity"] and (step > slots or slots > after["replay_capacity"]):
+        return f"replay_capacity: {slots} there, {after['replay_capacity']} here"
+    if step == before["total_steps"] and step % before["eval_every"]:
+        return (
+            f"its last evaluation, at step {step:,}, is not a multiple of eval_every "
+            f"({before['eval_every']:,})"
+        )
+    return None
 
 
 def versions() -> dict[str, str]:
@@ -171,6 +228,30 @@ def to_arrays(state: LaneState) -> dict[str, np.ndarray]:
     """The leaves under the names of their places; typed keys as their data."""
     leaves = jax.tree_util.tree_leaves_with_path(state)
     return {jax.tree_util.keystr(path): _to_array(leaf) for path, leaf in leaves}
+
+
+def _extended(arrays: dict[str, np.ndarray], program: Program, lane: Lane) -> dict[str, np.ndarray]:
+    """Arrays of a lane that now has more steps: longer ones end as those of a new lane do."""
+
+    def longer(lane: Lane) -> dict[str, jax.Array]:
+        leaves = jax.tree_util.tree_leaves_with_path(program.init(lane))
+        named = {jax.tree_util.keystr(path): leaf for path, leaf in leaves}
+        return {
+            name: leaf
+            for name, leaf in named.items()
+            if name in arrays and not _is_key(leaf) and _is_head(arrays[name].shape, leaf.shape)
+        }
+
+    tails = {n: np.asarray(leaf)[len(arrays[n]) :] for n, leaf in jax.jit(longer)(lane).items()}
+    return {
+        name: np.concatenate([array, tails[name]]) if name in tails else array
+        for name, array in arrays.items()
+    }
+
+
+def _is_head(short: tuple[int, ...], long: tuple[int, ...]) -> bool:
+    """Whether an array of the first shape may be the beginning of one of the second."""
+    return len(short) == len(long) > 0 and short[0] < long[0] and short[1:] == long[1:]
 
 
 def from_arrays(

@@ -11,6 +11,7 @@ import dataclasses
 import gc
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -116,9 +117,16 @@ def _default_device() -> Any:
 
 
 def make_groups(
-    jobs: Sequence[Job], strategy: str, devices: int, at_once: int | None = None
+    jobs: Sequence[Job],
+    strategy: str,
+    devices: int,
+    at_once: int | None = None,
+    checkpoints: Checkpoints | None = None,
 ) -> list[Group]:
     """Groups of one lane (``map``), or one group per program and device (``vmap``).
+
+    With ``checkpoints``, only lanes that go on from the same step are grouped, so that one that is
+    new does not make the others start over.
 
     With ``at_once``, no more lanes than that are under way together, each device under ``vmap``:
     groups are split, and wait for those before them.
@@ -128,7 +136,8 @@ def make_groups(
         return [Group([job], wave=index // most) for index, job in enumerate(jobs)]
     by_program: dict[Any, list[Job]] = {}
     for job in jobs:
-        by_program.setdefault((job.program, _structure(job.lane)), []).append(job)
+        step = 0 if checkpoints is None else checkpoints.newest(job)
+        by_program.setdefault((job.program, _structure(job.lane), step), []).append(job)
     shares = [
         members[start::devices]
         for members in by_program.values()
@@ -289,6 +298,31 @@ def _chunk(group: Group, device: jax.Device, rates: dict[Any, float]) -> None:
     _advanced(group, state, stop)
 
 
+_COPIES = 3
+"""Programs that differ in nothing but the environment's object, from which on a warning says so."""
+
+
+def _warn_of_copies(program: Program) -> None:
+    """Warn, once, where a new environment object is made for each training."""
+    kind = type(program.env)
+
+    def rest(program: Program) -> tuple[object, ...]:
+        return program.config, program.observation_size, program.action_shape
+
+    copies = {
+        id(other.env)
+        for other, *_ in _programs
+        if type(other.env) is kind and rest(other) == rest(program)
+    }
+    if kind.__eq__ is object.__eq__ and len(copies) + 1 == _COPIES:
+        warnings.warn(
+            f"{_COPIES} programs of {kind.__name__} differ only in the environment's object, and "
+            "each costs its compilation and some 100 MiB: use one object, or inherit "
+            "rtd.ValueIdentity, which says when two are equal",
+            stacklevel=2,
+        )
+
+
 class _Compiled:
     """The executables of one program, compiled by whoever needs them first."""
 
@@ -314,6 +348,8 @@ def _compiled(program: Program, lane: Lane, batched: bool, device: jax.Device) -
     if key not in _programs:
         make_room()
     with _programs_lock:
+        if key not in _programs:
+            _warn_of_copies(program)
         entry = _programs.setdefault(key, _Compiled())
     with entry.lock:
         if entry.executables is None:

@@ -10,13 +10,25 @@ from rich.progress import Progress as Bar
 
 from rtd3jax.training.lanes import Group, Job
 
+LONG_SECONDS = 60.0
+"""After which a training counts as long."""
+
 
 class Progress:
-    """A context in which `update` is called after every chunk."""
+    """A context in which `update` is called after every chunk.
+
+    ``remark`` is shown once, above the bar, when the training has become a long one.
+    """
 
     def __init__(
-        self, groups: Sequence[Group], label: Callable[[Job], str], *, enabled: bool = True
+        self,
+        groups: Sequence[Group],
+        label: Callable[[Job], str],
+        *,
+        enabled: bool = True,
+        remark: str = "",
     ):
+        self._remark = remark
         self._groups = groups
         self._label = label
         self._began = time.perf_counter()
@@ -33,8 +45,8 @@ class Progress:
             console=Console(stderr=True),
             disable=not enabled,
         )
-        total = sum(group.total * len(group.jobs) for group in groups)
-        self._task = self._bar.add_task("", total=total, rate="compiling", returns="")
+        self._total = sum(group.total * len(group.jobs) for group in groups)
+        self._task = self._bar.add_task("", total=self._total, rate="compiling", returns="")
 
     def __enter__(self) -> "Progress":
         self._bar.start()
@@ -53,7 +65,11 @@ class Progress:
             if curve.size:
                 self._latest[self._label(job), id(job)] = float(curve[-1])
         done = self._done()
-        rate = (done - self._start) / max(time.perf_counter() - self._began, 1e-9)
+        elapsed = time.perf_counter() - self._began
+        if self._remark and elapsed > LONG_SECONDS and done < self._total:
+            self._bar.console.print(self._remark, markup=False, highlight=False)
+            self._remark = ""
+        rate = (done - self._start) / max(elapsed, 1e-9)
         self._bar.update(
             self._task, completed=done, rate=f"{rate:,.0f} steps/s", returns=self._returns()
         )

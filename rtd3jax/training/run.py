@@ -41,6 +41,7 @@ _REASONS = {
     LOSS_NOT_FINITE: "the critics' loss is not finite; lower actor_learning_rate and "
     "critic_learning_rate",
 }
+_NO_CHECKPOINTS = "no checkpoints are kept: if this process ends, all is lost (checkpoint_dir=...)"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,8 +140,9 @@ def train(
         params: the environment's parameters; its own by default.
         progress: whether to show a bar.
         checkpoint_dir: where lanes keep checkpoints. The same call again goes on from them, to the
-            bit; seeds that were finished are not trained again. Of several configurations each has
-            a directory there, ``config-0``, ``config-1``, ...
+            bit; seeds that were finished are not trained again, and go on where ``total_steps`` is
+            larger now. Of several configurations each has a directory there, ``config-0``,
+            ``config-1``, ... Without it, a process that is killed loses everything.
         checkpoint_seconds: between two checkpoints of a lane; five minutes by default, or longer
             where they would cost more than 2%.
         strategy: ``map`` (lanes one by one, each on one core) or ``vmap`` (side by side); by
@@ -162,19 +164,20 @@ def train(
         for index, one in enumerate(configs)
         for job in make_jobs(env, one, seeds, params=params, cell=index)
     ]
-    groups = make_groups(jobs, check_strategy(strategy), len(workers()))
     checkpoints = None
     if checkpoint_dir is not None:
         directory = user_path(checkpoint_dir)
         parts = [directory] if single else [directory / f"config-{k}" for k in range(len(configs))]
         checkpoints = _checkpoints(parts, configs, env, checkpoint_seconds)
+    strategy, remark = check_strategy(strategy), "" if checkpoints is not None else _NO_CHECKPOINTS
+    groups = make_groups(jobs, strategy, len(workers()), checkpoints=checkpoints)
 
     def label(job: Job) -> str:
         own = configs[job.owner[0]]
         number = "" if single else f" {job.owner[0]}"
         return f"{own.algorithm} l={own.history_length}{number}"
 
-    with Progress(groups, label, enabled=progress) as bar:
+    with Progress(groups, label, enabled=progress, remark=remark) as bar:
         advance_groups(groups, bar.update, checkpoints)
     if checkpoints is not None:
         for group in groups:

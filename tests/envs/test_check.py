@@ -287,6 +287,25 @@ def test_every_world_of_ours_passes(env_id, disturbance):
     check_env(make(env_id, disturbance, max_steps_in_episode=12))
 
 
+def test_a_time_limit_of_one_step_is_a_warning(recwarn):
+    class Once(Good):
+        default_params = environment.EnvParams(max_steps_in_episode=1)
+
+    class Bandit(TimeLimitTerminates):
+        default_params = environment.EnvParams(max_steps_in_episode=1)
+
+    check_env(Once())
+    (warning,) = [w for w in recwarn if w.category is UserWarning]
+    assert "environment Once: a time limit ends all 8 episodes at their first step; " in str(
+        warning.message
+    )
+    assert find_problems(Once()) == []
+    recwarn.clear()
+    check_env(Bandit())  # nothing follows its end, and nothing is bootstrapped
+    check_env(Good())
+    assert not [w for w in recwarn if w.category is UserWarning]
+
+
 def test_nan_equals_nan():
     """A world of NaN is not finite, and nothing else."""
 

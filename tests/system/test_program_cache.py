@@ -3,10 +3,12 @@
 import jax
 import numpy as np
 import pytest
+from gymnax.environments import environment
 
 import rtd3jax as rtd
 from rtd3jax.system import program_cache as programs
 from rtd3jax.training import lanes
+from rtd3jax.training.loop import make_lane, make_program
 
 SETTINGS = {"hidden_size": 4, "batch_size": 4, "learning_starts": 10, "total_steps": 30}
 SETTINGS |= {"eval_every": 30, "eval_episodes": 1}
@@ -75,3 +77,32 @@ def test_looks_are_seldom(monkeypatch):
     monkeypatch.setattr(programs, "_mappings", lambda: pytest.fail("looked"))
     monkeypatch.setattr(programs, "_looked", programs.time.monotonic())
     assert not programs.make_room()
+
+
+def test_equal_environments_share_a_program_and_copies_are_warned_of(monkeypatch, recwarn):
+    class Tank(environment.Environment):
+        def __init__(self, pipes=1):
+            self.pipes = pipes
+
+    class Equal(rtd.ValueIdentity, Tank):
+        def identity(self):
+            return (self.pipes,)
+
+    monkeypatch.setattr(lanes, "_programs", {})
+    monkeypatch.setattr(lanes, "_compile", lambda *_: ())
+    lane = make_lane(rtd.Config("td3", **SETTINGS), 0, ())
+    device = lanes.workers()[0]
+
+    def compiled(env, **changes):
+        config = rtd.Config("td3", **SETTINGS | changes)
+        lanes._compiled(make_program(env, config, 1, (1,)), lane, False, device)
+        return len(lanes._programs)
+
+    assert [compiled(Equal()) for _ in range(4)] == [1] * 4
+    assert compiled(Equal(2)) == 2
+    assert [compiled(Tank(), hidden_size=width) for width in (4, 5, 6)] == [3, 4, 5]
+    assert not [w for w in recwarn if w.category is UserWarning]
+    for _ in range(4):
+        compiled(Tank())
+    (warning,) = [w for w in recwarn if w.category is UserWarning]
+    assert "3 programs of Tank differ only in the environment's object" in str(warning.message)

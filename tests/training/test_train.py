@@ -1,12 +1,15 @@
 """The trainer's contracts: determinism, independence of lanes, lengths side by side."""
 
 import dataclasses
+import types
 
 import jax
 import numpy as np
 import pytest
 
 import rtd3jax as rtd
+from rtd3jax.training.lanes import make_groups
+from rtd3jax.training.run import make_jobs
 
 TINY = rtd.Config(
     algorithm="lstm-td3-1ha1hc",
@@ -70,8 +73,7 @@ def test_vmap_agrees_with_map():
 
 
 def test_a_lost_lane_is_reported_and_does_not_touch_the_others():
-    from rtd3jax.training.lanes import advance_groups, make_groups
-    from rtd3jax.training.run import make_jobs
+    from rtd3jax.training.lanes import advance_groups
 
     # A broken configuration and a sound one share a program, and stand side by side.
     broken = dataclasses.replace(TINY, algorithm="td3", critic_learning_rate=1e30)
@@ -111,7 +113,7 @@ def test_bad_seeds_are_refused(seeds):
 def test_lengths_side_by_side_equal_exact_windows():
     """One program, two lanes of different history length; each equals its own exact program."""
     from rtd3jax.study.plan import Cell, cell_jobs
-    from rtd3jax.training.lanes import advance_groups, make_groups
+    from rtd3jax.training.lanes import advance_groups
     from rtd3jax.training.run import collect
 
     configs = [
@@ -164,3 +166,35 @@ def test_jax_debug_nans_does_not_end_a_training():
     finally:
         jax.config.update("jax_debug_nans", False)
     assert not run.failures
+
+
+def test_a_long_training_without_checkpoints_says_so_once(capsys, monkeypatch, tmp_path):
+    from rtd3jax.training import progress, run
+
+    group = types.SimpleNamespace(jobs=[None], step=10, total=30, returns=np.zeros((1, 1)))
+    for seconds, times in ((0.0, 1), (60.0, 0)):
+        monkeypatch.setattr(progress, "LONG_SECONDS", seconds)
+        with progress.Progress([group], str, remark=run._NO_CHECKPOINTS) as bar:
+            bar.update(group)
+            bar.update(group)
+        assert capsys.readouterr().err.count("no checkpoints are kept") == times
+
+    remarks = []
+
+    def begun(*_, remark, **__):
+        remarks.append(remark)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run, "Progress", begun)
+    for directory in (None, tmp_path):
+        with pytest.raises(KeyboardInterrupt):
+            rtd.train(_rover(), TINY, [0], checkpoint_dir=directory)
+    assert remarks == [run._NO_CHECKPOINTS, ""]
+
+
+def test_side_by_side_only_lanes_of_the_same_step_advance_together():
+    jobs = make_jobs(_rover(), TINY, [0, 1, 2], cell="cell")
+    steps = {0: 40, 1: 40, 2: 0}
+    kept = types.SimpleNamespace(newest=lambda job: steps[job.owner[1]])
+    groups = make_groups(jobs, "vmap", 1, checkpoints=kept)
+    assert [[job.owner[1] for job in group.jobs] for group in groups] == [[0, 1], [2]]

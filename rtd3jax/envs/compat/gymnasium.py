@@ -5,6 +5,7 @@ gymnasium is imported by gymnax already, so that nothing here makes importing rt
 
 import functools
 import os
+import weakref
 from collections.abc import Callable
 from typing import Any
 
@@ -34,7 +35,9 @@ _PROCESS = os.getpid()
 """The process that imported JAX; forked ones inherit its locks but not its threads."""
 
 _seen: dict[Any, tuple[gymnasium.Space, gymnasium.Space]] = {}
-"""Spaces of what was made, for forked processes, which cannot find them out."""
+"""Spaces of what was made, for forked processes, which cannot find them out. Those of an object go
+when it goes; of names the last `_MOST_SEEN` are kept."""
+_MOST_SEEN = 256
 
 
 def _check_process() -> None:
@@ -52,12 +55,19 @@ class GymnasiumEnv(gymnasium.Env):
 
     The reset and the step are compiled programs. ``step`` returns the final observation of an
     episode and does not begin another; only ``reset`` does. A time limit is ``truncated``. ``info``
-    has what the environment put there, as numpy arrays.
+    has what the environment put there, as numpy arrays. With ``render_mode="rgb_array"``,
+    ``render`` gives a picture, uint8 [height, width, 3].
     """
 
-    metadata = {"render_modes": []}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
 
-    def __init__(self, env: Any, params: Any = None) -> None:
+    def __init__(self, env: Any, params: Any = None, render_mode: str | None = None) -> None:
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise UserError(
+                f"render_mode {render_mode!r} is unknown; there is 'rgb_array', or None"
+            )
+        self.render_mode = render_mode
+        self._episode: Any = None
         self.world = env
         self.params = parameters_of(env, params)
         self.action_space, self.observation_space = _spaces(env, self.params)
@@ -75,7 +85,14 @@ class GymnasiumEnv(gymnasium.Env):
         self._key = np.uint32(self.np_random.integers(2**32, dtype=np.uint32))
         self._time, self._over = 0, False
         observation, self._state = _reset(self.world, self.params, self._key)
-        return self._observation(observation), {}
+        observation = self._observation(observation)
+        if self.render_mode is not None:
+            if self._episode is None:
+                from rtd3jax.envs.compat.frames import Episode
+
+                self._episode = Episode(self.world, self.params)
+            self._episode.begin(observation, self._state)
+        return observation, {}
 
     def step(self, action: ArrayLike) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One step of the episode; gymnasium.error.ResetNeeded after its end."""
@@ -90,7 +107,22 @@ class GymnasiumEnv(gymnasium.Env):
         self._time += 1
         self._over = bool(terminated) or bool(truncated)
         info = jax.tree.map(np.asarray, info)
-        return self._observation(final), float(reward), bool(terminated), bool(truncated), info
+        observation = self._observation(final)
+        if self._episode is not None:
+            self._episode.add(action, observation, float(reward), info)
+        return observation, float(reward), bool(terminated), bool(truncated), info
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """The present moment, uint8 [height, width, 3]; None and a warning without a mode."""
+        if self.render_mode is None:
+            gymnasium.logger.warn(
+                'render() draws nothing without a mode: give render_mode="rgb_array" when the '
+                "environment is made"
+            )
+            return None
+        if self._episode is None:
+            raise gymnasium.error.ResetNeeded("there is nothing to draw yet: call reset")
+        return self._episode.frame()
 
     def _observation(self, observation: Any) -> np.ndarray:
         return np.asarray(observation, self.observation_space.dtype)
@@ -102,13 +134,14 @@ class _Forked(GymnasiumEnv):
     What a vector environment's process raises earlier does not reach the one that uses it.
     """
 
-    def __init__(self, key: Any) -> None:
+    def __init__(self, key: Any, render_mode: str | None) -> None:
         if key not in _seen:
             _check_process()
+        self.render_mode = render_mode
         self.action_space, self.observation_space = _seen[key]
 
 
-def to_gymnasium(env: Any, *, params: Any = None) -> GymnasiumEnv:
+def to_gymnasium(env: Any, *, params: Any = None, render_mode: str | None = None) -> GymnasiumEnv:
     """Any gymnax >= 1.0 environment as a ``gymnasium.Env``, ours or anyone's, discrete or not.
 
     ``gymnasium.make("rtd3jax/Rover-ar1-slip-v0", sigma=0.1)`` does the same by name, once rtd3jax
@@ -117,25 +150,43 @@ def to_gymnasium(env: Any, *, params: Any = None) -> GymnasiumEnv:
     Args:
         env: the environment; its time limit is reported as ``truncated``.
         params: its parameters; its own by default.
+        render_mode: ``rgb_array`` for pictures by ``render``; None draws nothing.
 
     Raises:
         UserError: for what is not a gymnax >= 1.0 environment; in forked processes.
     """
-    return _made(id(env), lambda: GymnasiumEnv(env, params))
+    made = _made(id(env), render_mode, lambda: GymnasiumEnv(env, params, render_mode))
+    try:
+        weakref.finalize(env, _seen.pop, id(env), None)
+    except TypeError:  # of what cannot be followed, nothing is kept
+        _seen.pop(id(env), None)
+    return made
 
 
-def make_gymnasium(env_id: str, disturbance: str, **parameters: Any) -> GymnasiumEnv:
+def make_gymnasium(
+    env_id: str, disturbance: str, render_mode: str | None = None, **parameters: Any
+) -> GymnasiumEnv:
     """The entry point of the registered ids."""
     key = env_id, disturbance, repr(parameters)
-    return _made(key, lambda: GymnasiumEnv(make(env_id, disturbance, **parameters)))
+
+    def construct() -> GymnasiumEnv:
+        return GymnasiumEnv(make(env_id, disturbance, **parameters), render_mode=render_mode)
+
+    return _made(key, render_mode, construct)
 
 
-def _made(key: Any, construct: Callable[[], GymnasiumEnv]) -> GymnasiumEnv:
+# Where gymnasium.make looks for the modes, so that it can make others ("rgb_array_list") of ours.
+make_gymnasium.metadata = GymnasiumEnv.metadata  # type: ignore[attr-defined]
+
+
+def _made(key: Any, render_mode: str | None, construct: Callable[[], GymnasiumEnv]) -> GymnasiumEnv:
     """What ``construct`` makes, or in a forked process what stands for it."""
     if os.getpid() != _PROCESS:
-        return _Forked(key)
+        return _Forked(key, render_mode)
     env = construct()
     _seen[key] = env.action_space, env.observation_space
+    while len(_seen) > _MOST_SEEN:
+        del _seen[next(iter(_seen))]
     return env
 
 

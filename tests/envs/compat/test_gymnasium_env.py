@@ -1,7 +1,9 @@
 """Our worlds under Gymnasium's own checker, and by its rules about ends and seeds."""
 
+import gc
 import subprocess
 import sys
+import types
 import warnings
 
 import gymnasium
@@ -15,6 +17,7 @@ from gymnax.environments import environment, spaces
 
 import rtd3jax as rtd
 from rtd3jax.envs.compat import gymnasium as gymnasium_env
+from rtd3jax.envs.compat.frames import Episode
 from rtd3jax.envs.compat.gymnasium import gymnasium_id
 from rtd3jax.errors import UserError
 
@@ -53,7 +56,8 @@ def test_gymnasiums_checker_is_content_with_registered_worlds(env_id):
     env = gymnasium.make(env_id)
     with warnings.catch_warnings():
         # It would like bounded observations and actions within one: advice, not rules.
-        warnings.filterwarnings("ignore", message=".*(Box|render|jax).*")
+        warnings.filterwarnings("ignore", message=".*Box.*")
+        warnings.filterwarnings("error", message=".*[Rr]ender.*")
         check_env(env.unwrapped)
     assert env.unwrapped.spec.id == env_id
 
@@ -189,6 +193,116 @@ def test_stable_baselines3_trains_on_it():
     ends = np.flatnonzero(model.replay_buffer.dones[:300])
     np.testing.assert_array_equal(ends, [199])
     assert model.replay_buffer.timeouts[199] == 1.0
+
+
+def turning(frames):
+    """Pixels of the plant's half that differ between the first frame and the last."""
+    return int(np.any(frames[0][:, :300] != frames[-1][:, :300], axis=-1).sum())
+
+
+@pytest.mark.parametrize(
+    "env_id", ["rtd3jax/Pendulum-hidden-v0", "rtd3jax/Rover-ar1-slip-v0", "Pendulum-delay"]
+)
+def test_an_episode_is_drawn_until_its_last_step(env_id):
+    if "/" in env_id:
+        env = gymnasium.make(env_id, render_mode="rgb_array", max_steps_in_episode=3)
+    else:
+        world = rtd.make("pendulum", "delay", steps=2)
+        params = world.default_params
+        params = params.replace(env=params.env.replace(max_steps_in_episode=3))
+        env = rtd.to_gymnasium(world, params=params, render_mode="rgb_array")
+    env.reset(seed=0)
+    frames, over = [env.render()], False
+    while not over:
+        *_, over, _ = env.step(np.ones(env.action_space.shape, np.float32))
+        frames.append(env.render())
+    assert len(frames) == 4
+    assert all(f.shape == (360, 640, 3) and f.dtype == np.uint8 for f in frames)
+    assert turning(frames) > 100
+    env.reset(seed=0)
+    np.testing.assert_array_equal(env.render(), frames[0])
+
+
+def test_what_has_no_drawing_shows_its_signals():
+    env = rtd.to_gymnasium(Falling(), render_mode="rgb_array")
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.render()
+    env.reset(seed=0)
+    env.step(np.ones(1))
+    assert env.render().shape == (360, 640, 3)
+
+
+def test_the_pendulum_stands_where_its_angle_says():
+    env = rtd.to_gymnasium(rtd.make("pendulum"))
+    episode = Episode(env.world, env.params)
+    for angle, right in ((np.pi / 2, False), (-np.pi / 2, True)):
+        episode.begin(np.zeros(3), types.SimpleNamespace(theta=angle, theta_dot=0.0))
+        blue = np.all(episode.frame()[:, :310] == (0, 114, 178), axis=-1)
+        columns = np.flatnonzero(blue.any(axis=0))
+        assert (columns.mean() > 166) == right  # the axle's column
+
+
+def test_without_a_mode_nothing_is_drawn_nor_kept():
+    env = gymnasium.make("rtd3jax/Rover-ar1-slip-v0")
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="render_mode"):
+        assert env.unwrapped.render() is None
+    assert env.unwrapped._episode is None
+    with pytest.raises(UserError, match="render_mode 'ansi' is unknown"):
+        rtd.to_gymnasium(Falling(), render_mode="ansi")
+
+
+def test_vector_environments_and_lists_of_frames_work_too():
+    name = "rtd3jax/Rover-ar1-slip-v0"
+    many = gymnasium.make_vec(name, num_envs=2, vectorization_mode="sync", render_mode="rgb_array")
+    many.reset(seed=0)
+    many.step(many.action_space.sample())
+    assert [frame.shape for frame in many.render()] == [(360, 640, 3)] * 2
+    listed = gymnasium.make(name, render_mode="rgb_array_list")
+    listed.reset(seed=0)
+    listed.step(listed.action_space.sample())
+    assert len(listed.render()) == 2
+
+
+def test_stable_baselines3_makes_and_checks_ours_by_name():
+    pytest.importorskip("stable_baselines3")
+    from stable_baselines3.common import env_checker, env_util
+
+    many = env_util.make_vec_env("rtd3jax/Rover-ar1-slip-v0", n_envs=2)
+    many.reset()
+    assert many.render().ndim == 3
+    env_checker.check_env(gymnasium.make("rtd3jax/Rover-ar1-slip-v0", render_mode="rgb_array"))
+
+
+class Uncached:
+    """Falling, unknown to JAX's caches: gymnax's own compiled methods keep their environment."""
+
+    default_params = ()
+
+    def reset(self, key, params):
+        return jnp.zeros(1), State(jnp.int32(0), jnp.float32(0.0))
+
+    def step(self, key, state, action, params):
+        seen = jnp.zeros(1)
+        return seen, state, jnp.float32(0.0), False, False, {"final_observation": seen}
+
+    def action_space(self, params):
+        return spaces.Box(-1.0, 1.0, (1,))
+
+
+def test_spaces_are_kept_as_long_as_their_environment(monkeypatch):
+    monkeypatch.setattr(gymnasium_env, "_seen", {})
+    monkeypatch.setattr(gymnasium_env, "_MOST_SEEN", 3)
+    for _ in range(2):
+        world = Uncached()
+        made = rtd.to_gymnasium(world)
+        assert list(gymnasium_env._seen) == [id(world)]
+        del made, world
+        gc.collect()
+        assert not gymnasium_env._seen
+    for steps in range(5):
+        gymnasium.make("rtd3jax/Rover-none-v0", max_steps_in_episode=steps + 1)
+    assert len(gymnasium_env._seen) == 3
 
 
 def test_a_forked_process_is_told_to_spawn(monkeypatch):

@@ -1,0 +1,169 @@
+"""What a study consists of, as ``config.json`` has it, and how it grows.
+
+A study is every cell with every seed. It grows by seeds, by cells and by more steps of a cell; what
+would make another lane of one that is there is refused.
+"""
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rtd3jax.errors import UserError
+from rtd3jax.study.plan import Cell, cell_jobs
+from rtd3jax.training.checkpoint import LONGER
+from rtd3jax.training.lanes import Job
+from rtd3jax.training.run import check_seeds
+
+_NAMED = 3
+"""Cells whose names are spelt out in a line for people."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Contents:
+    """Cells, each with all of the seeds.
+
+    Attributes:
+        cells: those of the beginning first, then those that were added.
+        seeds: likewise.
+        episodes: of the final evaluation.
+        stages: how many cells there were before each time that cells were added.
+    """
+
+    cells: tuple[Cell, ...]
+    seeds: tuple[int, ...]
+    episodes: int
+    stages: tuple[int, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in config.json."""
+        found = {
+            "cells": [cell.to_dict() for cell in self.cells],
+            "seeds": list(self.seeds),
+            "final_episodes": self.episodes,
+        }
+        return {**found, "stages": list(self.stages)} if self.stages else found
+
+    @classmethod
+    def read(cls, config: Path) -> "Contents":
+        """Those of a configuration file.
+
+        Raises:
+            UserError: when there is none, or it is not a study's.
+        """
+        study = read_config(config)["study"]
+        try:
+            cells = tuple(Cell.from_dict(dict(cell)) for cell in study["cells"])
+            seeds, episodes = check_seeds(study["seeds"]), int(study["final_episodes"])
+            stages = tuple(int(count) for count in study.get("stages", ()))
+        except (KeyError, TypeError, ValueError) as error:
+            raise UserError(f"{config} is not a study's configuration") from error
+        return cls(cells, seeds, episodes, stages)
+
+    def jobs(self, strategy: str) -> list[Job]:
+        """A job for each lane; see `cell_jobs`."""
+        return cell_jobs(self.cells, self.seeds, strategy, self.stages)
+
+    def lacks(self, asked: "Contents") -> bool:
+        """Whether ``asked`` has something that is not here."""
+        return grown(self, asked) != self
+
+
+def read_config(config: Path) -> dict[str, Any]:
+    """The content of a configuration file.
+
+    Raises:
+        UserError: when there is none, or it is not a study's.
+    """
+    try:
+        content = json.loads(config.read_text("utf-8"))
+        content["study"]["cells"]
+        return content
+    except OSError as error:
+        raise UserError(f"there is no study in {config.parent} ({error.strerror})") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{config} is not a study's configuration") from error
+
+
+def grown(there: Contents, asked: Contents) -> Contents:
+    """What is there, and what is asked for besides.
+
+    Raises:
+        UserError: naming the field, when a lane that is there would become another one.
+    """
+    if there.episodes != asked.episodes:
+        raise UserError(f"final_episodes: {there.episodes} there, {asked.episodes} here")
+    wanted = {_key(cell): cell for cell in asked.cells}
+    cells = [_larger(cell, wanted.pop(_key(cell), cell)) for cell in there.cells]
+    stages = there.stages
+    if wanted:
+        cells, stages = [*cells, *wanted.values()], (*stages, len(cells))
+    seeds = tuple(dict.fromkeys((*there.seeds, *asked.seeds)))
+    return Contents(tuple(cells), seeds, there.episodes, stages)
+
+
+def longer_cells(there: Contents, now: Contents) -> list[tuple[Cell, Cell]]:
+    """Cells that have more steps now: (as it was, as it is)."""
+    pairs = zip(there.cells, now.cells, strict=False)
+    return [(before, after) for before, after in pairs if before != after]
+
+
+def what_was_added(there: Contents, now: Contents) -> str:
+    """In words, for one line; empty where nothing was."""
+    added = now.cells[len(there.cells) :]
+    words = []
+    if seeds := now.seeds[len(there.seeds) :]:
+        words.append(f"seed{'s' * (len(seeds) > 1)} {_listed(list(map(str, seeds)))}")
+    if added:
+        one = f"{len(added)} cell{'s' * (len(added) > 1)}"
+        words.append(f"{one} ({_listed([cell_words(cell) for cell in added])}{_odd(there, added)})")
+    for before, after in longer_cells(there, now):
+        words.append(
+            f"{after.config.total_steps:,} steps for {before.config.total_steps:,} of "
+            f"{cell_words(after)}"
+        )
+    return ", ".join(words[:_NAMED] + (["more steps of other cells"] if words[_NAMED:] else []))
+
+
+def cell_words(cell: Cell) -> str:
+    """A cell in a few words."""
+    length = f" l={cell.config.history_length}" if cell.config.history_length else ""
+    return f"{cell.env} {cell.disturbance} {cell.config.algorithm}{length}"
+
+
+def _key(cell: Cell) -> tuple[Any, ...]:
+    return tuple(cell.key.values())
+
+
+def _larger(there: Cell, asked: Cell) -> Cell:
+    """``asked``, if it is ``there`` with as many steps or more."""
+    before, after = there.to_dict(), asked.to_dict()
+    longer = after["total_steps"] > before["total_steps"]
+    for name in before:
+        if before[name] != after[name] and not (longer and name in LONGER):
+            raise UserError(f"{name}: {before[name]} there, {after[name]} here")
+    return asked
+
+
+def _odd(there: Contents, added: Sequence[Cell]) -> str:
+    """Fields in which added cells differ from all that were there: a forgotten flag, perhaps."""
+    old = [cell.to_dict() for cell in there.cells]
+    words: dict[str, None] = {}
+    for cell in added:
+        for name, value in _own(cell).items():
+            if all(other[name] != value for other in old):
+                before = _listed(list(dict.fromkeys(str(other[name]) for other in old)))
+                words[f"{name} {value} where it was {before}"] = None
+    return "".join(f"; {word}" for word in words)
+
+
+def _own(cell: Cell) -> Mapping[str, Any]:
+    """The configuration without what names the cell."""
+    names = {"replay_capacity", *cell.key}  # its default is total_steps
+    return {n: value for n, value in cell.config.to_dict().items() if n not in names}
+
+
+def _listed(words: Sequence[str]) -> str:
+    few = [*words[:_NAMED], f"{len(words) - _NAMED} more"] if len(words) > _NAMED + 1 else words
+    return ", ".join(few)
