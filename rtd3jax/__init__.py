@@ -16,7 +16,7 @@ from rtd3jax.envs.identity import ValueIdentity
 from rtd3jax.envs.pendulum.filter import filter_policy
 from rtd3jax.envs.processes.disturbances import DampedSine, GaussianNoise, Hidden, Pulses, Sine
 from rtd3jax.envs.processes.faults import Delay, Dropout, GainDrift, OrnsteinUhlenbeck, Quantisation
-from rtd3jax.envs.processes.process import Chain, Nothing, Process, Sum
+from rtd3jax.envs.processes.process import Chain, NoDisturbance, Nothing, Process, Sum
 from rtd3jax.envs.registry import make, register
 from rtd3jax.envs.rover.optimum import bayes_policy
 from rtd3jax.errors import UserError
@@ -50,6 +50,7 @@ __all__ = [
     "Hidden",
     "Memory",
     "NetworkSpec",
+    "NoDisturbance",
     "Nothing",
     "OrnsteinUhlenbeck",
     "Policy",

@@ -8,6 +8,7 @@ import pytest
 from rtd3jax.envs import registry
 
 ROOT = pathlib.Path(__file__).parent.parent
+PACKAGE = ROOT / "rtd3jax"
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK = re.compile(r"```python\n(.*?)```", re.DOTALL)
 
@@ -41,3 +42,15 @@ def test_the_guides_promises_about_length():
     """A plant in 30 to 40 lines, a disturbance in about 15."""
     plant, process = BLOCK.findall((ROOT / "docs" / "bring_a_world.md").read_text())[:2]
     assert 30 <= len(plant.splitlines()) <= 45 and len(process.splitlines()) <= 16
+
+
+@pytest.mark.parametrize("path", [*DOCUMENTS, ROOT / "CONTRIBUTING.md"], ids=lambda path: path.stem)
+def test_modules_that_are_named_exist(path):
+    named = re.findall(r"`((?:[a-z_]+/)+[a-z_]+\.py)`", path.read_text())
+    missing = [name for name in named if not any((top / name).is_file() for top in (ROOT, PACKAGE))]
+    assert missing == []
+
+
+def test_where_is_has_twenty_places():
+    named = re.findall(r"`((?:[a-z_]+/)+[a-z_]+\.py)`", (ROOT / "CONTRIBUTING.md").read_text())
+    assert len(set(named)) >= 20

@@ -11,13 +11,13 @@ from jax.typing import ArrayLike
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.identity import ValueIdentity, strong
 from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT, describe, foreign_code
-from rtd3jax.envs.processes.process import Chain, Nothing, Process
+from rtd3jax.envs.processes.process import Chain, NoDisturbance, Process
 from rtd3jax.errors import UserError, nearest
 from rtd3jax.protocols import ComposableEnvironment, EnvironmentLike
 
 REWARDS_FROM = ("state", "observation")
-CHANNELS = {"observation": "process", "action": "action", "reward": "reward"}
-"""What can be disturbed, and the field of ``DisturbedParams`` that holds its process."""
+CHANNELS = ("observation", "action", "reward")
+"""What can be disturbed: fields of ``DisturbedParams``, each of which holds a process."""
 
 # Streams of the action's and the reward's processes, folded into the observation's key: far from
 # the small numbers by which processes fold and split it further.
@@ -25,20 +25,25 @@ _ACTION_STREAM, _REWARD_STREAM = 0x61637400, 0x72657700
 
 
 class DisturbedParams(struct.PyTreeNode):
-    """Parameters of the environment below and of the processes."""
+    """Parameters of the undisturbed environment, and the processes that disturb it."""
 
     env: Any
-    process: Process = Nothing()
+    observation: Process = NoDisturbance()
     """of the observation [O]"""
-    action: Process = Nothing()
+    action: Process = NoDisturbance()
     """of the flat action [A], between the agent and the environment"""
-    reward: Process = Nothing()
+    reward: Process = NoDisturbance()
     """of the reward, as a signal [1]"""
 
     @property
     def max_steps_in_episode(self) -> int | jax.Array:
-        """Episode length, which belongs to the environment below."""
+        """Episode length, a parameter of the undisturbed environment."""
         return self.env.max_steps_in_episode
+
+    @property
+    def process(self) -> Process:
+        """The observation's process, by the name of earlier versions."""
+        return self.observation
 
 
 class DisturbedState(struct.PyTreeNode):
@@ -47,7 +52,7 @@ class DisturbedState(struct.PyTreeNode):
     time: jax.Array
     """int32 []: steps taken"""
     env: Any
-    """true state of the environment below"""
+    """state of the undisturbed environment"""
     process: Any
     """state of the observation's disturbance, reset with the episode"""
     action: ArrayLike
@@ -64,8 +69,8 @@ class Disturbed(ValueIdentity, environment.Environment):
     The observation's process sees the first observation of an episode, then one more at every step,
     the final one included; the observation after an automatic reset belongs to a newly drawn
     process. The dynamics never see it. The action's process changes what the dynamics receive, and
-    so whatever the reward charges for an action; the environment below limits it as it limits any
-    action.
+    so whatever the reward charges for an action; the undisturbed environment limits it as it limits
+    any action.
 
     ``reward_from="observation"`` computes the reward from the observation that the agent saw before
     it acted, the paper's ``noise`` case; the reward's process acts after that.
@@ -95,7 +100,7 @@ class Disturbed(ValueIdentity, environment.Environment):
         self._default_params = default_params
 
     def identity(self) -> tuple:
-        """The environment below and the source of the reward."""
+        """The undisturbed environment, and the source of the reward."""
         return (self.base, self.reward_from)
 
     @property
@@ -107,11 +112,11 @@ class Disturbed(ValueIdentity, environment.Environment):
 
     def _size(self, params: DisturbedParams, full: int) -> int:
         """Elements seen of ``full``; raises UserError if a process does not fit its signal."""
-        size = params.process.output_size(full)
+        size = params.observation.output_size(full)
         if self.reward_from == "observation" and size != full:
             raise UserError(
                 f"reward_from='observation' needs the full observation, of which "
-                f"{type(params.process).__name__} leaves {size} of {full} elements; "
+                f"{type(params.observation).__name__} leaves {size} of {full} elements; "
                 "use reward_from='state'"
             )
         return size
@@ -128,8 +133,8 @@ class Disturbed(ValueIdentity, environment.Environment):
         (full,) = true_observation.shape
         self._size(params, full)
         horizon = getattr(params, "max_steps_in_episode", DEFAULT_STEP_LIMIT)
-        process = params.process.init(key_init, horizon, full)
-        observation, process = params.process.step(key_process, process, true_observation)
+        process = params.observation.init(key_init, horizon, full)
+        observation, process = params.observation.step(key_process, process, true_observation)
         state = DisturbedState(
             time=jnp.zeros((), jnp.int32),
             env=env,
@@ -157,15 +162,15 @@ class Disturbed(ValueIdentity, environment.Environment):
         applied, action_state = params.action.step(key_action, state.action, action.reshape(-1))
         applied = applied.reshape(action.shape)
         with foreign_code():
-            true_observation, env, below, terminated, info = self.base.step_env(
+            true_observation, env, true_reward, terminated, info = self.base.step_env(
                 key_env, state.env, applied, params.env
             )
         true_observation = jnp.asarray(true_observation, jnp.float32)
-        reward = below = jnp.asarray(below, jnp.float32)
+        reward = true_reward = jnp.asarray(true_reward, jnp.float32)
         if self.reward_from == "observation":
             reward = self.base.observed_reward(state.observation, applied, params.env)
         reward, reward_state = params.reward.step(key_reward, state.reward, reward.reshape(1))
-        observation, process = params.process.step(key_process, state.process, true_observation)
+        observation, process = params.observation.step(key_process, state.process, true_observation)
         evolved = DisturbedState(
             time=state.time + 1,
             env=env,
@@ -176,23 +181,23 @@ class Disturbed(ValueIdentity, environment.Environment):
         )
         info = {
             **info,
-            "true_reward": info.get("true_reward", below),
+            "true_reward": info.get("true_reward", true_reward),
             "true_observation": true_observation,
         }
         return observation, strong(evolved), reward.reshape(()), terminated, info
 
     def is_terminated(self, state: DisturbedState, params: DisturbedParams) -> jax.Array:
-        """Whether the environment below ended by itself."""
+        """Whether the undisturbed environment ended by itself."""
         return self.base.is_terminated(state.env, params.env)
 
     def is_truncated(self, state: DisturbedState, params: DisturbedParams) -> jax.Array:
-        """Whether the environment below reached its time limit."""
+        """Whether the undisturbed environment reached its time limit."""
         with foreign_code():
             return self.base.is_truncated(state.env, params.env)
 
     @property
     def name(self) -> str:
-        """The name of the environment below."""
+        """The name of the undisturbed environment."""
         return self.base.name
 
     @property
@@ -255,9 +260,8 @@ def disturb(
     else:
         describe(env, params)
         params = DisturbedParams(env=params)
-    field = CHANNELS[channel]
     assert isinstance(params, DisturbedParams)
-    params = params.replace(**{field: sequence(getattr(params, field), process)})
+    params = params.replace(**{channel: sequence(getattr(params, channel), process)})
     disturbed = Disturbed(base, reward_from, params)
     check_fit(disturbed)
     return disturbed
@@ -267,9 +271,9 @@ def sequence(*processes: Process) -> Process:
     """The processes one after the other, as flat as can be."""
     flat: list[Process] = []
     for process in processes:
-        if not isinstance(process, Nothing):
+        if not isinstance(process, NoDisturbance):
             flat += process.processes if isinstance(process, Chain) else [process]
-    return Chain(tuple(flat)) if len(flat) > 1 else flat[0] if flat else Nothing()
+    return Chain(tuple(flat)) if len(flat) > 1 else flat[0] if flat else NoDisturbance()
 
 
 def check_fit(env: Disturbed) -> None:

@@ -31,7 +31,7 @@ from rtd3jax.envs.processes.faults import (
     OrnsteinUhlenbeck,
     Quantisation,
 )
-from rtd3jax.envs.processes.process import Nothing, Process, require
+from rtd3jax.envs.processes.process import NoDisturbance, Process, require
 from rtd3jax.errors import UserError, nearest
 from rtd3jax.protocols import EnvironmentLike
 
@@ -77,7 +77,7 @@ class _Entry:
     about: About = About()
 
 
-_NONE: dict[str, tuple[str, Process]] = {"none": ("observation", Nothing())}
+_NONE: dict[str, tuple[str, Process]] = {"none": ("observation", NoDisturbance())}
 _entries: dict[str, _Entry] = {}
 
 
@@ -338,10 +338,10 @@ def _disturbed(env_id: str, entry: _Entry, disturbance: str, parameters: dict[st
         params = params.replace(**{channel: on(channel)})
     if entry.with_params is not None:
         base = entry.with_params(params)
-        if all(isinstance(on(channel), Nothing) for channel in CHANNELS):
+        if all(isinstance(on(channel), NoDisturbance) for channel in CHANNELS):
             return base
-    fields = {field: on(channel) for channel, field in CHANNELS.items()}
-    env = Disturbed(base, reward_from, DisturbedParams(env=params, **fields))
+    acting = {channel: on(channel) for channel in CHANNELS}
+    env = Disturbed(base, reward_from, DisturbedParams(env=params, **acting))
     check_fit(env)
     return env
 

@@ -31,7 +31,7 @@ def check_fit(
     """
     if not (callable(getattr(policy, "init", None)) and callable(getattr(policy, "step", None))):
         raise UserError(f"{type(policy).__name__} is not a policy: it needs init and step")
-    remedy = "use it on the kind of world that it was made for"
+    remedy = "use it on the kind of environment that it was made for"
     expected = getattr(policy, "observation_size", observation_size)
     if expected != observation_size:
         raise UserError(

@@ -1,4 +1,4 @@
-"""Ceilings of a study's worlds, kept in its run directory once they are computed."""
+"""Ceilings of a study's environments, kept in its run directory once they are computed."""
 
 import json
 import sys
@@ -10,7 +10,7 @@ from rtd3jax.envs.about import Ceiling
 from rtd3jax.errors import UserError, first_line
 from rtd3jax.evaluation.ceiling import ceiling
 from rtd3jax.study.plan import Cell
-from rtd3jax.study.results import number
+from rtd3jax.study.results import rounded_number
 from rtd3jax.system.files import write_bytes_atomically
 from rtd3jax.system.versions import versions_of
 
@@ -53,7 +53,7 @@ def compute_ceilings(directory: Path, cells: Sequence[Cell]) -> None:
 
 
 def _entry(best: Ceiling) -> dict[str, Any]:
-    mean, error = number(best.mean), number(best.standard_error)
+    mean, error = rounded_number(best.mean), rounded_number(best.standard_error)
     return {"mean": mean, "error": error, "kind": best.kind}
 
 

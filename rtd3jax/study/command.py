@@ -1,4 +1,4 @@
-"""What the commands have in common: how bad input ends them, and how worlds are brought in."""
+"""What the commands have in common: how bad input ends them, and how modules of a user are."""
 
 import argparse
 import importlib
@@ -41,7 +41,7 @@ def add_import(group: argparse._ActionsContainer) -> None:
         action="append",
         default=[],
         metavar="MODULE",
-        help="a Python module that registers worlds (rtd3jax.register)",
+        help="a Python module that registers environments, agents or memories",
     )
 
 
@@ -62,7 +62,7 @@ def run_parser(
 
 
 def import_worlds(modules: Sequence[str]) -> None:
-    """Import what registers worlds (``--import``); found in the working directory too."""
+    """Import what registers environments or agents (``--import``); the working directory counts."""
     for module in modules:
         sys.path.insert(0, os.getcwd())
         try:

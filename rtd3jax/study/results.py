@@ -165,7 +165,7 @@ def reference_names(table: pd.DataFrame) -> list[str]:
     return sorted(names, key=lambda name: (name != "random", name))
 
 
-def number(value: SupportsFloat) -> float | None:
+def rounded_number(value: SupportsFloat) -> float | None:
     """For JSON: five significant digits, or None for what is not finite."""
     value = float(value)
     return float(f"{value:.5g}") if math.isfinite(value) else None

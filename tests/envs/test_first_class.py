@@ -127,7 +127,7 @@ def test_a_process_within_the_dynamics_is_a_channel(tank):
     env = rtd.make("tank", "leaky+dropout", most=0.02, p=0.5, target=0.4)
     params = env.default_params
     assert params.env.leak == Leak(0.02) and params.env.target == 0.4
-    assert params.process == rtd.Dropout(p=0.5)
+    assert params.observation == rtd.Dropout(p=0.5)
     assert rtd.make("tank").default_params.env.leak == rtd.Nothing()
     with pytest.raises(rtd.UserError, match="target=0.0 must be greater than 0"):
         rtd.make("tank", target=0.0)

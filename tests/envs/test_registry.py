@@ -114,13 +114,17 @@ def test_default_parameters_are_each_environments_own(env_id, disturbance, name,
 
 def test_parameters_go_to_the_process_then_to_the_environment():
     params = make("pendulum", "temporal-bias", count=3, amplitude_max=2, g=9.81).default_params
-    assert (params.process.count, params.process.amplitude_max, params.env.g) == (3, 2.0, 9.81)
-    assert isinstance(params.process.amplitude_max, float)
+    assert (params.observation.count, params.observation.amplitude_max, params.env.g) == (
+        3,
+        2.0,
+        9.81,
+    )
+    assert isinstance(params.observation.amplitude_max, float)
     assert make("pendulum", max_steps_in_episode=50).default_params.max_steps_in_episode == 50
     params = make("rover", "ar1-slip", rho=0.5, wheelbase=1.0).default_params
     assert (params.slip.rho, params.wheelbase) == (0.5, 1.0)
     assert make("PointRobot-misc", dense_reward=True).default_params.dense_reward is True
-    assert make("pendulum", "random-sine", elements=1).default_params.process.elements == (1,)
+    assert make("pendulum", "random-sine", elements=1).default_params.observation.elements == (1,)
 
 
 def test_variants_are_the_papers():
@@ -136,7 +140,7 @@ def test_variants_are_the_papers():
         "ar1-slip-fast": (0.05, 0.90),
         "ar1-slip-slow": (0.05, 0.98),
     }
-    sine = make("pendulum", "temporal-sine").default_params.process
+    sine = make("pendulum", "temporal-sine").default_params.observation
     assert sine == Sine(1.0, 1.0, 70.0, 70.0, elements=(0, 1), waves=1)
 
 
@@ -249,7 +253,7 @@ def test_a_registered_environment_gets_parameters_and_disturbances(monkeypatch):
     assert env.base is base and env == make("robot", "noise+lag+dropout")
     params = env.default_params
     assert params.env.max_force == 0.2 and params.action == Delay(3)
-    assert params.process == Chain((GaussianNoise(0.1), Dropout(p=0.5)))
+    assert params.observation == Chain((GaussianNoise(0.1), Dropout(p=0.5)))
     assert make("robot", max_steps_in_episode=7).default_params.max_steps_in_episode == 7
     with pytest.raises(UserError, match="did you mean 'noise'"):
         make("robot", "nois")
@@ -271,9 +275,11 @@ def test_a_cell_that_runs_again_registers_again(monkeypatch):
     run("notebook", base, disturbances={"lag": Delay(3)})
     with pytest.raises(UserError, match="cannot be called"):
         run("notebook", base, disturbances={"a+b": Delay()})
-    assert make("robot", "lag").default_params.process == Delay(3), "what failed replaced nothing"
+    assert make("robot", "lag").default_params.observation == Delay(3), (
+        "what failed replaced nothing"
+    )
     run("notebook", base, disturbances={"lag": Delay(5)})
-    assert make("robot", "lag").default_params.process == Delay(5)
+    assert make("robot", "lag").default_params.observation == Delay(5)
     run("notebook", lambda disturbance: disturbance)
     assert make("robot", "wind") == "wind"
     with pytest.raises(UserError, match="registered by notebook; .* replace=True"):

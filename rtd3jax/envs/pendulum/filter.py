@@ -29,7 +29,7 @@ from rtd3jax.envs.processes.disturbances import (
     Sine,
     element_mask,
 )
-from rtd3jax.envs.processes.process import Nothing, Process
+from rtd3jax.envs.processes.process import NoDisturbance, Process
 from rtd3jax.errors import UserError
 from rtd3jax.protocols import EnvironmentLike
 
@@ -133,10 +133,12 @@ def filter_policy(env: EnvironmentLike) -> FilterPolicy:
         UserError: for other environments and disturbances.
     """
     params, base = env.default_params, env
-    process: Process = Nothing()
+    process: Process = NoDisturbance()
     if isinstance(env, Disturbed):
-        base, process = env.base, params.process
-        if not (isinstance(params.action, Nothing) and isinstance(params.reward, Nothing)):
+        base, process = env.base, params.observation
+        if not (
+            isinstance(params.action, NoDisturbance) and isinstance(params.reward, NoDisturbance)
+        ):
             raise UserError("filter_policy does not cover disturbed actions or rewards")
         params = params.env
     if not isinstance(base, Pendulum):
@@ -164,7 +166,7 @@ def _sensor(process: Process) -> Sensor:
     elif isinstance(process, Sine | DampedSine) and len(process.elements) > 1:
         mask = element_mask(process.elements, 3)
         later = everything - np.outer(mask, mask) / mask.sum()
-    elif not isinstance(process, Nothing):
+    elif not isinstance(process, NoDisturbance):
         raise UserError(
             f"filter_policy does not cover {type(process).__name__} as it is set here; it covers "
             "noise, hidden without the speed, and sines that add to two elements or more"

@@ -8,7 +8,7 @@ below.
 from rtd3jax.envs.about import Ceiling
 from rtd3jax.envs.disturbed import Disturbed
 from rtd3jax.envs.pendulum.value_iteration import mean_optimal_return
-from rtd3jax.envs.processes.process import Nothing
+from rtd3jax.envs.processes.process import NoDisturbance
 from rtd3jax.errors import UserError
 from rtd3jax.protocols import EnvironmentLike
 
@@ -23,12 +23,15 @@ def best_return(env: EnvironmentLike, episodes: int = 0, seed: int = 0) -> Ceili
     """
     params, disturbed = env.default_params, False
     if isinstance(env, Disturbed):
-        if env.reward_from != "state" or not isinstance(params.reward, Nothing):
+        if env.reward_from != "state" or not isinstance(params.reward, NoDisturbance):
             raise UserError(
                 "a reward that is itself disturbed has no known ceiling; "
                 "make the environment with reward_from='state'"
             )
-        disturbed = not (isinstance(params.process, Nothing) and isinstance(params.action, Nothing))
+        disturbed = not (
+            isinstance(params.observation, NoDisturbance)
+            and isinstance(params.action, NoDisturbance)
+        )
         params = params.env
     mean, error = mean_optimal_return(params)
     return Ceiling(mean, error, "upper bound" if disturbed else "exact")

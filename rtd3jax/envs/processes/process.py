@@ -34,7 +34,7 @@ class Process(struct.PyTreeNode):
         """Raise UserError, naming the parameter, if a concrete parameter makes no sense."""
 
 
-class Nothing(Process):
+class NoDisturbance(Process):
     """Leaves the signal as it is."""
 
     def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> tuple[()]:
@@ -46,6 +46,10 @@ class Nothing(Process):
     ) -> tuple[jax.Array, tuple[()]]:
         """The signal and the empty state, unchanged."""
         return signal, state
+
+
+Nothing = NoDisturbance
+"""The name of earlier versions."""
 
 
 class Chain(Process):

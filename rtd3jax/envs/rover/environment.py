@@ -13,7 +13,7 @@ from gymnax.environments import environment, spaces
 from jax.typing import ArrayLike
 
 from rtd3jax.envs.identity import ValueIdentity, strong
-from rtd3jax.envs.processes.process import Nothing, Process, float32
+from rtd3jax.envs.processes.process import NoDisturbance, Process, float32
 from rtd3jax.envs.rover.slip import WHEELS
 
 
@@ -27,7 +27,7 @@ class RoverParams(struct.PyTreeNode):
     """m/s"""
     target_yaw_rate: float = 0.0
     """rad/s"""
-    slip: Process = Nothing()
+    slip: Process = NoDisturbance()
     max_speed: float = 1.0
     """m/s, bound of the speed command [choice]: at a slip of at most 0.5, holding the target never
     needs more"""

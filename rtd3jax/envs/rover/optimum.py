@@ -14,7 +14,7 @@ from flax import struct
 from jax.scipy.stats import norm
 
 from rtd3jax.envs.about import Ceiling
-from rtd3jax.envs.processes.process import Nothing, Process
+from rtd3jax.envs.processes.process import NoDisturbance, Process
 from rtd3jax.envs.rover.environment import Rover, RoverParams
 from rtd3jax.envs.rover.slip import WHEELS, Ar1Slip, SineSlip
 from rtd3jax.errors import UserError
@@ -74,7 +74,7 @@ def bayes_policy(env: EnvironmentLike, model: Process | None = None) -> BayesPol
         raise UserError("bayes_policy is known for the rover alone")
     params = env.default_params
     model = params.slip if model is None else model
-    if not isinstance(model, Ar1Slip | Nothing):
+    if not isinstance(model, Ar1Slip | NoDisturbance):
         raise UserError(
             f"the conditional moments of {type(model).__name__} are not known; "
             "give an Ar1Slip as the model"
@@ -135,7 +135,7 @@ def _traction_moments(
     model: Process, slip: jax.Array, first_step: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """E[1 - s] and E[(1 - s)^2] of the slip that the next command meets, per wheel: [2] each."""
-    if isinstance(model, Nothing):
+    if isinstance(model, NoDisturbance):
         ones = jnp.ones((2,), jnp.float32)
         return ones, ones
     assert isinstance(model, Ar1Slip)

@@ -24,9 +24,9 @@ from rtd3jax.study.results import (
     EPISODES,
     METRICS,
     is_trained,
-    number,
     read_table,
     reference_names,
+    rounded_number,
 )
 from rtd3jax.study.rundir import LOG, RunDirectory, lane_of, read_log, steps_reached
 from rtd3jax.study.statistics import Summary, iqm_bands, summarise
@@ -162,7 +162,7 @@ def _references(
     found = []
     for name in reference_names(here):
         of_policy = here[here["algorithm"] == name]
-        found.append({"name": name, **{m: number(of_policy[m].mean()) for m in measures}})
+        found.append({"name": name, **{m: rounded_number(of_policy[m].mean()) for m in measures}})
     return found
 
 
@@ -179,9 +179,9 @@ def _curve(rows: pd.DataFrame, measure: str) -> dict[str, Any] | None:
     return {
         "steps": [int(step) for step in table.columns],
         "seeds": [int(seeds) for seeds in count],
-        "iqm": [number(value) for value in iqm],
-        "low": [number(value) for value in low],
-        "high": [number(value) for value in high],
+        "iqm": [rounded_number(value) for value in iqm],
+        "low": [rounded_number(value) for value in low],
+        "high": [rounded_number(value) for value in high],
     }
 
 
@@ -194,7 +194,7 @@ def _learning(rows: pd.DataFrame) -> dict[str, Any]:
         found[metric] = {
             "steps": [int(step) for step in table.columns],
             "seeds": [int(seeds) for seeds in table.count()],
-            "iqm": [number(value) for value in table.mean()],
+            "iqm": [rounded_number(value) for value in table.mean()],
             "low": nothing,
             "high": nothing,
         }
@@ -208,7 +208,7 @@ def _final(lanes: pd.DataFrame, measure: str) -> dict[str, Any] | None:
     values = lanes[measure].to_numpy(np.float64)
     return {
         **summary_data(summarise(values)),
-        "values": [number(value) for value in values if math.isfinite(value)],
+        "values": [rounded_number(value) for value in values if math.isfinite(value)],
     }
 
 
@@ -217,11 +217,11 @@ def summary_data(summary: Summary) -> dict[str, Any]:
     return {
         "n": summary.n,
         "lost": summary.failed,
-        "mean": number(summary.mean),
-        "std": number(summary.std),
-        "iqm": number(summary.iqm),
-        "low": number(summary.iqm_low),
-        "high": number(summary.iqm_high),
+        "mean": rounded_number(summary.mean),
+        "std": rounded_number(summary.std),
+        "iqm": rounded_number(summary.iqm),
+        "low": rounded_number(summary.iqm_low),
+        "high": rounded_number(summary.iqm_high),
     }
 
 
@@ -264,8 +264,8 @@ def _timing(rows: list[dict[str, Any]], directory: RunDirectory) -> dict[str, An
     return {
         "steps": steps,
         "sessions": len(ends),
-        "seconds": number(seconds),
-        "steps_per_second": number(steps / seconds) if seconds else None,
+        "seconds": rounded_number(seconds),
+        "steps_per_second": rounded_number(steps / seconds) if seconds else None,
     }
 
 

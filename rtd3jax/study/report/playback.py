@@ -30,7 +30,7 @@ from rtd3jax.policies.fit import check_fit
 from rtd3jax.protocols import EnvironmentLike, PolicyLike
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.report.data import rows_of
-from rtd3jax.study.results import number
+from rtd3jax.study.results import rounded_number
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.system.files import write_bytes_atomically
 from rtd3jax.system.program_cache import make_room
@@ -174,7 +174,7 @@ def _scene(env: EnvironmentLike, drawing: Drawing, sizes: dict[str, int]) -> dic
     """
     params, elements = env.default_params, list(range(sizes["true"]))
     if isinstance(env, Disturbed):
-        process, params = params.process, params.env
+        process, params = params.observation, params.env
         processes = process.processes if isinstance(process, Chain) else (process,)
         for part in processes:
             if isinstance(part, Hidden):
@@ -190,8 +190,8 @@ def _scene(env: EnvironmentLike, drawing: Drawing, sizes: dict[str, int]) -> dic
         # Which true element each seen one shows; None where that is not known.
         "elements": elements if len(elements) == sizes["seen"] else None,
         "actions": _names(drawing.action, "a", sizes["action"]),
-        "seconds": None if seconds is None else number(getattr(params, seconds)),
-        "constants": {name: number(getattr(params, name)) for name in drawing.constants},
+        "seconds": None if seconds is None else rounded_number(getattr(params, seconds)),
+        "constants": {name: rounded_number(getattr(params, name)) for name in drawing.constants},
         "hidden": met,
     }
 

@@ -276,10 +276,10 @@ def test_names_are_joined_and_parameters_find_their_owner():
     env = make("rover", "ar1-slip+dropout+delay+gain-drift", rho=0.5, p=0.3, steps=4, wheelbase=0.8)
     params = env.default_params
     assert (params.env.slip.rho, params.env.wheelbase) == (0.5, 0.8)
-    assert params.process == Chain((Dropout(p=0.3), Delay(4)))
+    assert params.observation == Chain((Dropout(p=0.3), Delay(4)))
     assert params.action == GainDrift()
     assert make("pendulum", "noise+delay").reward_from == "observation"
-    assert make("pendulum", "none+none").default_params.process == Nothing()
+    assert make("pendulum", "none+none").default_params.observation == Nothing()
 
 
 @pytest.mark.parametrize(
