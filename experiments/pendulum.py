@@ -4,13 +4,14 @@ Usage: python experiments/pendulum.py [--quick] [--run DIR] [--out DIR] [--steps
                                       [--lengths L ...] [--width H] [--disturbances D ...]
                                       [--algorithms A ...] [--report]
 
-Trains the studies of experiments/pendulum_studies.py in run directories of the sweep below DIR; the
-same command goes on with what is missing. Then tests each agent under its own disturbance, and
-those of `random-sine` under five other conditions, 1,000 episodes each. Writes pendulum.md,
-.parquet and .png, the learning curves, and generalisation.md and .parquet. The paper has five
-seeds, lengths 1 to 20 and width 128; the table says what was run. `--report` does not train.
-`--disturbances` and `--algorithms` are for parts of it, each in another DIR. Rows of lanes that are
-not in DIR stay as they are; those of an earlier setting are marked.
+Trains the cells of experiments/pendulum_cells.py that are not in the table yet, as a study in DIR;
+the same command goes on with what is missing, also in another DIR: rows in the table are not
+trained again. Then tests each agent under its own disturbance, and those of `random-sine` under
+five other conditions, 1,000 episodes each. Writes pendulum.md and .parquet, generalisation.md and
+.parquet, pendulum_curves.parquet, and the pictures of experiments/pendulum_figures.py. The paper
+has five seeds, lengths 1 to 20 and width 128; the table says what was run. `--report` does not
+train: it gathers what all run directories below DIR hold, half a study included. Rows of lanes that
+are not there stay as they are; those of an earlier setting are marked.
 
 Returns are normalised: 0 is the uniform-random policy, 1 the fully observed optimum.
 """
@@ -23,22 +24,20 @@ import time
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
 import rtd3jax as rtd
 from rtd3jax.envs.registry import parse_disturbance
 from rtd3jax.errors import UserError
 from rtd3jax.study import presets
-from rtd3jax.study.colours import colour_of
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.transfer import transfer
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-from pendulum_studies import current_setting, settings_of, studies  # noqa: E402
+from pendulum_cells import cells, current_setting, missing, settings_of  # noqa: E402
+from pendulum_figures import draw_all  # noqa: E402
 from settings import mark, notes, setting_text  # noqa: E402
 from writing import (  # noqa: E402
     RESULTS,
-    keep_curves,
     markdown_table,
     provenance,
     write_results,
@@ -52,6 +51,8 @@ CONDITIONS = (
     "noise:sigma=1.0",
 )
 """Under which agents of `random-sine` are tested (the paper's generalisation figure)."""
+LENGTHS = (6, 20, 1, 3, 10)
+"""The paper's, in an order in which there is soon a figure that can be read."""
 ALL_DISTURBANCES = (*presets.PENDULUM_DISTURBANCES, *presets.ACTION_HISTORY_DISTURBANCES)
 TEST_EPISODES = 1_000
 EARLIER_EPISODES = 20
@@ -81,22 +82,23 @@ def tested(run: pathlib.Path, trained_on: str, episodes: int) -> pd.DataFrame:
     when no lane is trained yet.
     """
     directory = RunDirectory.open(run)
-    directory.cells = [cell for cell in directory.cells if cell.disturbance == trained_on]
+    trained = [cell for cell in directory.cells if cell.disturbance == trained_on]
     conditions = CONDITIONS if trained_on == "random-sine" else (trained_on,)
     try:
-        returns = transfer(directory, conditions, episodes, write=False)
+        returns = transfer(directory, conditions, episodes, cells=trained, write=False)
     except UserError as error:
         print(f"missing: trained on {trained_on}: {error}")
         return pd.DataFrame()
     lane = ["algorithm", "history_length", "trained_on", "tested_on", "seed"]
     lanes = returns.groupby(lane, as_index=False)["true_return"].mean()
     lanes["normalised"] = normalised(lanes, "tested_on")
-    config = directory.cells[0].config  # agents of a study share all but what they are
+    configs = {(c.config.algorithm, c.config.tokens): c.config for c in directory.cells}
+    own = [configs[key] for key in zip(lanes["algorithm"], lanes["history_length"], strict=True)]
     return lanes.assign(
         episodes=episodes,
-        steps=config.total_steps,
-        width=config.hidden_size,
-        setting=own_setting(config),
+        steps=[config.total_steps for config in own],
+        width=[config.hidden_size for config in own],
+        setting=[own_setting(config) for config in own],
     )
 
 
@@ -177,45 +179,21 @@ def facts(lanes: pd.DataFrame, began: float) -> dict[str, object]:
     )
 
 
-def draw(lanes: pd.DataFrame, path: pathlib.Path) -> None:
-    """The paper's final returns against the agent: a panel per disturbance, dots are seeds."""
-    names = [name for name in ALL_DISTURBANCES if (lanes["disturbance"] == name).any()]
-    columns = min(len(names), 4)
-    rows = -(-len(names) // columns)
-    figure = Figure(figsize=(2.6 * columns + 1.6, 3.4 * rows), layout="constrained")
-    panels = figure.subplots(rows, columns, sharey=True, squeeze=False)
-    for axes in panels.flat[len(names) :]:
-        axes.axis("off")
-    for axes, name in zip(panels.flat, names, strict=False):
-        here = lanes[lanes["disturbance"] == name]
-        agents = [agent for agent in rtd.ALGORITHMS if (here["algorithm"] == agent).any()]
-        for index, algorithm in enumerate(agents):
-            own = here[here["algorithm"] == algorithm]
-            lengths = sorted(own["history_length"].unique())
-            for k, length in enumerate(lengths):
-                values = own[own["history_length"] == length]["normalised"]
-                x = index + 0.7 * ((k + 0.5) / len(lengths) - 0.5)
-                axes.plot(
-                    [x] * len(values), values, ".", ms=4, color=colour_of(algorithm), alpha=0.5
-                )
-                axes.plot(x, values.mean(), "_", ms=9, mew=2, color=colour_of(algorithm))
-        axes.axhline(1.0, color="#777777", lw=0.8)
-        axes.set_xticks(range(len(agents)), agents, rotation=60, ha="right")
-        axes.set_xlim(-0.6, len(agents) - 0.4)
-        steps = sorted(here["steps"].unique())
-        axes.set_title(f"{name}\n{' and '.join(f'{n:,}' for n in steps)} steps", fontsize=10)
-        axes.grid(axis="y", color="#E4E4E4", lw=0.6)
-    for axes in panels[:, 0]:
-        axes.set_ylabel("normalised return")
-    figure.savefig(path, dpi=150)
+def curves_of(run: pathlib.Path) -> pd.DataFrame:
+    """Learning curves of a run directory, normalised: a row per lane and evaluation."""
+    kept = pd.read_parquet(run / "curves.parquet")
+    kept = kept.assign(normalised=normalised(kept, "disturbance").round(4))
+    configs = {tuple(c.key.values()): c.config for c in RunDirectory.open(run).cells}
+    own = kept[["env", "disturbance", "algorithm", "history_length"]].itertuples(index=False)
+    settings = [own_setting(configs[tuple(key)]) for key in own]
+    names = ["algorithm", "history_length", "disturbance", "seed", "step", "normalised"]
+    return kept[names].assign(setting=settings)
 
 
-def report(
-    runs: list[pathlib.Path], options: argparse.Namespace, episodes: int, began: float
-) -> int:
-    """Write tables and pictures of what there is in the studies' run directories."""
-    begun = [run for run in runs if (run / "config.json").exists()]
-    found = {run: rows for run in begun if len(rows := all_tested(run, episodes))}
+def report(options: argparse.Namespace, episodes: int, began: float) -> int:
+    """Write tables and pictures of what there is in the run directories below ``options.run``."""
+    runs = [path.parent for path in sorted(options.run.rglob("config.json"))]
+    found = {run: rows for run in runs if len(rows := all_tested(run, episodes))}
     if not found:
         print(f"nothing is trained in {options.run} yet")
         return 1
@@ -226,21 +204,39 @@ def report(
     lanes["episodes"] = lanes["episodes"].fillna(EARLIER_EPISODES).astype(int)
     text = table(lanes, "disturbance", ALL_DISTURBANCES)
     write_results(options.out, "pendulum", lanes, text, facts(lanes, began))
-    draw(lanes, options.out / "pendulum.png")
-    for run in found:
-        keep_curves(run, options.out, f"pendulum_{options.run.name}_{run.name}")
+    curves = pd.concat([curves_of(run) for run in found], ignore_index=True)
+    curves_file = options.out / "pendulum_curves.parquet"
+    with_others(curves, curves_file, "disturbance").to_parquet(curves_file, index=False)
     print(text)
     carried = rows[rows["trained_on"] == "random-sine"].drop(columns="trained_on")
     if carried.empty:
         print("missing: generalisation: nothing is trained on random-sine")
-        return 0
-    moved = with_others(carried, options.out / "generalisation.parquet", "tested_on")
-    text = table(moved, "tested_on", CONDITIONS)
-    under = lanes[lanes["disturbance"] == "random-sine"]
-    about = {**facts(under, began), "episodes": episodes}
-    write_results(options.out, "generalisation", moved, text, about)
-    print(text)
+    else:
+        moved = with_others(carried, options.out / "generalisation.parquet", "tested_on")
+        text = table(moved, "tested_on", CONDITIONS)
+        under = lanes[lanes["disturbance"] == "random-sine"]
+        about = {**facts(under, began), "episodes": episodes}
+        write_results(options.out, "generalisation", moved, text, about)
+        print(text)
+    draw_all(options.out, options.out)
     return 0
+
+
+def train(options: argparse.Namespace, tiny: dict[str, object]) -> list[str]:
+    """Train the cells that the table lacks; a line for each lane that was lost."""
+    path = options.out / "pendulum.parquet"
+    table = pd.read_parquet(path) if path.exists() else pd.DataFrame()
+    if len(table) and "setting" not in table:
+        table = pd.DataFrame()  # of a version that did not note it
+    wanted = cells(options, tiny)
+    todo = missing(wanted, table, options.seeds)
+    print(f"{len(wanted) - len(todo)} of {len(wanted)} cells stand in {path}", flush=True)
+    if not todo:
+        return []
+    study = rtd.Study(
+        todo, seeds=range(options.seeds), out=options.run, final_episodes=1 if tiny else 20
+    )
+    return study.run(quiet=bool(tiny), page=not tiny)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -252,27 +248,22 @@ def main(arguments: list[str] | None = None) -> int:
         "--steps", type=int, default=presets.PENDULUM_STEPS, help="h-td3 has twice as many"
     )
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument(
-        "--lengths", type=int, nargs="+", default=[*presets.PENDULUM_HISTORY_LENGTHS]
-    )
+    parser.add_argument("--lengths", type=int, nargs="+", default=[*LENGTHS])
     parser.add_argument("--width", type=int, default=128)
     parser.add_argument("--disturbances", nargs="+", metavar="D", default=[], help="no others")
     parser.add_argument("--algorithms", nargs="+", metavar="A", default=list(rtd.ALGORITHMS))
     parser.add_argument("--report", action="store_true", help="no training")
     options = parser.parse_args(arguments)
-    began, more, episodes = time.time(), [], TEST_EPISODES
+    began, episodes = time.time(), TEST_EPISODES
+    tiny: dict[str, object] = {}
     if options.quick:
         options.steps, options.seeds, options.lengths, options.width = 60, 1, [1], 4
-        more = ["--learning-starts=50", "--eval-every=60", "--eval-episodes=1"]
-        more += ["--final-episodes=1", "--quiet", "--no-report"]
+        tiny = {"learning_starts": 50, "eval_every": 60, "eval_episodes": 1}
         options.disturbances, episodes = options.disturbances or ["random-sine"], 2
-    runs = []
-    for study in studies(options.disturbances, options.algorithms):
-        status = 0 if options.report else study.train(options.run / study.name, options, more)
-        if status not in (0, 1):
-            return status
-        runs.append(options.run / study.name)
-    return report(runs, options, episodes, began)
+    if not options.report:
+        for line in train(options, tiny):
+            print(line, file=sys.stderr)
+    return report(options, episodes, began)
 
 
 if __name__ == "__main__":

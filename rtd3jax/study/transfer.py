@@ -10,6 +10,7 @@ import pandas as pd
 from rtd3jax.envs.registry import make, parse_disturbance
 from rtd3jax.errors import UserError
 from rtd3jax.evaluation.rollout import both_returns
+from rtd3jax.study.plan import Cell
 from rtd3jax.study.report.transfer import COLUMNS, FILE
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.system.files import write_bytes_atomically
@@ -21,6 +22,7 @@ def transfer(
     episodes: int,
     say: Callable[[str], None] = print,
     *,
+    cells: Sequence[Cell] | None = None,
     write: bool = True,
 ) -> pd.DataFrame:
     """Test every trained policy of ``directory``; returns go to ``transfer.parquet``.
@@ -30,6 +32,7 @@ def transfer(
         tested_on: disturbances; by default those of the run, for each environment its own.
         episodes: for each policy and disturbance. A lane's seed is also that of its episodes, so
             that agents of one seed meet the same ones.
+        cells: those of the run whose policies are tested; all by default.
         write: whether to keep the table in the run directory.
         say: takes a line where a disturbance does not suit some policies.
 
@@ -41,7 +44,7 @@ def transfer(
     problems: dict[tuple[str, str, str], int] = {}
     # A file is read once, not for each disturbance.
     policy_of = functools.lru_cache(maxsize=len(directory.seeds))(directory.policy)
-    for cell in directory.cells:
+    for cell in directory.cells if cells is None else cells:
         own = list(dict.fromkeys(c.disturbance for c in directory.cells if c.env == cell.env))
         for disturbance in own if tested_on is None else tested_on:
             world = cell.env, disturbance

@@ -148,18 +148,22 @@ def test_the_pendulum_experiment_runs(tmp_path, capsys, monkeypatch):
     assert "--replay-capacity=20000" in table["setting"]["h-td3"]
     assert set(pd.read_parquet(out / "generalisation.parquet")["algorithm"]) == {"td3", "h-td3"}
     assert (out / "pendulum.png").stat().st_size > 5_000
-    assert (out / "pendulum_run_main_learning_curves.png").stat().st_size > 5_000
+    assert (out / "pendulum_learning_curves.svg").stat().st_size > 5_000
     said = capsys.readouterr().out
-    assert "not run" in said and "†" not in said
+    assert "0 of 2 cells stand in" in said and "not run" in said and "†" not in said
+
+    # What stands in the table is not trained again, wherever it was trained.
+    elsewhere = tmp_path / "elsewhere"
+    assert pendulum.main([*quick, "--run", str(elsewhere)]) == 1
+    assert "2 of 2 cells stand in" in capsys.readouterr().out and not elsewhere.exists()
 
     # Without a finished lane of random-sine there is nothing to carry over, and that is said.
-    lane = next((run / "h-td3" / "lanes").rglob("*.safetensors"))
-    kept = lane.read_bytes()
-    lane.unlink()
+    lanes = run / "lanes"
+    lanes.rename(run / "aside")
     again = ["--report", "--run", str(run)]
-    assert pendulum.main([*quick, *again]) == 0
+    assert pendulum.main([*quick, *again]) == 1
     assert "missing: trained on random-sine" in capsys.readouterr().out
-    lane.write_bytes(kept)
+    (run / "aside").rename(lanes)
 
     # Cells of a table from before settings were noted stay, and are marked.
     table.reset_index().drop(columns=["setting", "episodes"]).to_parquet(out / "pendulum.parquet")
@@ -172,12 +176,12 @@ def test_the_pendulum_experiment_runs(tmp_path, capsys, monkeypatch):
     assert "missing: generalisation" in said and said.count("†") == 3
     assert "† trained with the configuration's defaults" in said
     # Before the first lane ends there is nothing to report.
-    shutil.rmtree(tmp_path / "more" / "main" / "lanes")
+    shutil.rmtree(tmp_path / "more" / "lanes")
     assert pendulum.main([*quick, *more, "--report"]) == 1
     assert "nothing is trained" in capsys.readouterr().out
 
     pictures = load(EXPERIMENTS / "pendulum_pictures.py")
-    assert pictures.main(["--quick", "--run", str(run / "main"), "--out", str(out)]) == 0
+    assert pictures.main(["--quick", "--run", str(run), "--out", str(out)]) == 0
     assert "missing: " in capsys.readouterr().out
     assert (out / "pendulum_swing.gif").read_bytes().startswith(b"GIF")
 

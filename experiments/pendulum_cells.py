@@ -1,0 +1,81 @@
+"""What experiments/pendulum.py trains: the cells of the paper's pendulum figures.
+
+Six agents under the paper's four disturbances, and `lstm-td3` with and without past actions under
+three more, where the paper compares them; each at every window length. Their settings are those of
+the preset `pendulum`; experiments/pendulum_search.py found them, under `hidden`. `h-td3` has
+settings of its own: its critics read carries that an actor of long ago stored, and its actor moves
+on meanwhile.
+"""
+
+import argparse
+from typing import Any
+
+import pandas as pd
+from settings import setting_text
+
+import rtd3jax as rtd
+from rtd3jax.study import presets
+
+
+def settings_of(algorithm: str) -> dict[str, object]:
+    """Fields of the configuration in which the agent differs from the defaults."""
+    return {**presets.PENDULUM_SETTINGS, **presets.PENDULUM_OWN_SETTINGS.get(algorithm, {})}
+
+
+def current_setting(algorithm: str) -> str:
+    """`settings_of` the agent, as it stands in tables."""
+    return setting_text(settings_of(algorithm))
+
+
+def cells(options: argparse.Namespace, tiny: dict[str, Any]) -> list[rtd.Cell]:
+    """Those of the given lengths, disturbances and agents, in the order of the lengths.
+
+    Without ``options.disturbances`` the paper's, and its comparison of action history. ``tiny`` are
+    fields that make them small.
+    """
+    pairs = [
+        (disturbance, algorithm)
+        for disturbance in options.disturbances or presets.PENDULUM_DISTURBANCES
+        for algorithm in options.algorithms
+    ]
+    if not options.disturbances:
+        pairs += [
+            (disturbance, algorithm)
+            for disturbance in presets.ACTION_HISTORY_DISTURBANCES
+            for algorithm in ("lstm-td3", "lstm-td3-no-action")
+            if algorithm in options.algorithms
+        ]
+    found: dict[tuple[object, ...], rtd.Cell] = {}
+    for length in options.lengths:
+        for disturbance, algorithm in pairs:
+            factor = presets.PENDULUM_STEPS_FACTOR.get(algorithm, 1)
+            fields: dict[str, Any] = {
+                **settings_of(algorithm),
+                "total_steps": options.steps * factor,
+                "hidden_size": options.width,
+                **tiny,
+            }
+            config = rtd.Config(
+                algorithm=algorithm, history_length=length if algorithm != "td3" else None, **fields
+            )
+            cell = rtd.Cell("pendulum", disturbance, config)
+            found.setdefault(tuple(cell.key.values()), cell)
+    return list(found.values())
+
+
+def missing(wanted: list[rtd.Cell], lanes: pd.DataFrame, seeds: int) -> list[rtd.Cell]:
+    """The cells of which the table ``lanes`` lacks a seed, or has it of another training."""
+
+    def stands(cell: rtd.Cell) -> bool:
+        config = cell.config
+        own = lanes[
+            (lanes["algorithm"] == config.algorithm)
+            & (lanes["history_length"] == config.tokens)
+            & (lanes["disturbance"] == cell.disturbance)
+            & (lanes["setting"] == current_setting(config.algorithm))
+            & (lanes["steps"] == config.total_steps)
+            & (lanes["width"] == config.hidden_size)
+        ]
+        return set(range(seeds)) <= set(own["seed"])
+
+    return [cell for cell in wanted if lanes.empty or not stands(cell)]

@@ -1,0 +1,231 @@
+"""The paper's pendulum figures, drawn as the paper draws them, from the tables that are kept.
+
+Usage: python experiments/pendulum_figures.py [--results DIR] [--out DIR]
+
+Reads pendulum.parquet, pendulum_curves.parquet and generalisation.parquet, and writes, as PNG and
+SVG, what they have rows for:
+
+* pendulum_learning_curves: rows are disturbances, columns agents, a curve per length;
+* pendulum: final return against the agent, a line per length, dots are seeds;
+* action_history: `lstm-td3` with and without past actions, a panel per length;
+* generalisation: bars of the agents trained on `random-sine`, a panel per condition.
+
+Only rows of the current setting are drawn. Bands and bars are one standard deviation over seeds.
+"""
+
+import argparse
+import pathlib
+import sys
+
+import matplotlib
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+import rtd3jax as rtd
+from rtd3jax.study import presets
+from rtd3jax.study.colours import colour_of
+
+sys.path.insert(0, str(pathlib.Path(__file__).parent))
+from pendulum_cells import current_setting  # noqa: E402
+from writing import RESULTS  # noqa: E402
+
+DISTURBANCES = (*presets.PENDULUM_DISTURBANCES, *presets.ACTION_HISTORY_DISTURBANCES)
+GREY = "#777777"
+LINES = {0: "#000000", 1: "#56B4E9", 3: "#009E73", 6: "#E69F00", 10: "#D55E00", 20: "#CC79A7"}
+"""A colour per history length; 0 is an agent without one."""
+
+
+def current(rows: pd.DataFrame) -> pd.DataFrame:
+    """The rows that were trained with the setting of today."""
+    if rows.empty or "setting" not in rows:
+        return rows.iloc[:0]
+    return rows[rows["setting"] == rows["algorithm"].map(current_setting)]
+
+
+def save(figure: Figure, out: pathlib.Path, name: str) -> None:
+    """As PNG and SVG; the SVG is the same file whenever the data are."""
+    out.mkdir(parents=True, exist_ok=True)
+    figure.savefig(out / f"{name}.png", dpi=150)
+    with matplotlib.rc_context({"svg.hashsalt": name}):
+        figure.savefig(out / f"{name}.svg", metadata={"Date": None})
+
+
+def agents_in(rows: pd.DataFrame) -> list[str]:
+    """The agents of a table, in the paper's order."""
+    return [agent for agent in rtd.ALGORITHMS if (rows["algorithm"] == agent).any()]
+
+
+def lengths_in(rows: pd.DataFrame) -> list[int]:
+    """The history lengths of a table, the shortest first."""
+    return sorted(int(length) for length in rows["history_length"].unique())
+
+
+def name_of(length: int) -> str:
+    """A history length in a legend."""
+    return f"l = {length}" if length else "no window"
+
+
+def learning_curves(curves: pd.DataFrame) -> Figure:
+    """Mean over seeds of the normalised return, a band of one standard deviation."""
+    names = [name for name in DISTURBANCES if (curves["disturbance"] == name).any()]
+    agents = agents_in(curves)
+    figure = Figure(figsize=(2.1 * len(agents) + 1, 1.7 * len(names) + 0.6), layout="constrained")
+    panels = figure.subplots(len(names), len(agents), sharey=True, squeeze=False)
+    shown: dict[int, object] = {}
+    for row, name in zip(panels, names, strict=True):
+        for axes, agent in zip(row, agents, strict=True):
+            own = curves[(curves["disturbance"] == name) & (curves["algorithm"] == agent)]
+            for length in lengths_in(own):
+                of_length = own[own["history_length"] == length]
+                steps = of_length.groupby("step")["normalised"].agg(["mean", "std"]).fillna(0.0)
+                x = steps.index.to_numpy() / 1_000
+                (line,) = axes.plot(x, steps["mean"], color=LINES.get(length, GREY), lw=1.2)
+                low, high = steps["mean"] - steps["std"], steps["mean"] + steps["std"]
+                axes.fill_between(x, low, high, color=LINES.get(length, GREY), alpha=0.15, lw=0)
+                shown[length] = line
+            axes.axhline(1.0, color=GREY, lw=0.8)
+            axes.set_ylim(-0.1, 1.05)
+            axes.grid(color="#E4E4E4", lw=0.6)
+            if own.empty:
+                axes.text(0.5, 0.5, "not run", ha="center", va="center", transform=axes.transAxes)
+            if row is panels[0]:
+                axes.set_title(agent, fontsize=9)
+        row[0].set_ylabel(name, fontsize=9)
+    figure.supxlabel("thousand steps", fontsize=9)
+    figure.supylabel("normalised return", fontsize=9)
+    order = sorted(shown)
+    figure.legend(
+        [shown[length] for length in order],
+        [name_of(length) for length in order],
+        loc="outside right upper",
+        fontsize=8,
+    )
+    return figure
+
+
+def final_returns(lanes: pd.DataFrame) -> Figure:
+    """A panel per disturbance, agents across, a line per length; dots are seeds."""
+    names = [name for name in DISTURBANCES if (lanes["disturbance"] == name).any()]
+    columns = min(len(names), 4)
+    rows = -(-len(names) // columns)
+    figure = Figure(figsize=(2.6 * columns + 1.8, 3.4 * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, sharey=True, squeeze=False)
+    for axes in panels.flat[len(names) :]:
+        axes.axis("off")
+    shown: dict[int, object] = {}
+    for axes, name in zip(panels.flat, names, strict=False):
+        here = lanes[lanes["disturbance"] == name]
+        agents = agents_in(here)
+        for length in lengths_in(here):
+            own = here[here["history_length"] == length]
+            means = own.groupby("algorithm")["normalised"].mean()
+            x = [index for index, agent in enumerate(agents) if agent in means]
+            y = [means[agent] for agent in agents if agent in means]
+            colour = LINES.get(length, GREY)
+            (shown[length],) = axes.plot(x, y, "o-", color=colour, lw=1.2, ms=4)
+            for index, agent in enumerate(agents):
+                seeds = own[own["algorithm"] == agent]["normalised"]
+                axes.plot([index] * len(seeds), seeds, ".", ms=3, color=colour, alpha=0.4)
+        axes.axhline(1.0, color=GREY, lw=0.8)
+        axes.set_xticks(range(len(agents)), agents, rotation=60, ha="right")
+        axes.set_title(name, fontsize=10)
+        axes.grid(axis="y", color="#E4E4E4", lw=0.6)
+    for axes in panels[:, 0]:
+        axes.set_ylabel("normalised return")
+    order = sorted(shown)
+    figure.legend(
+        [shown[length] for length in order],
+        [name_of(length) for length in order],
+        loc="outside right upper",
+        fontsize=8,
+    )
+    return figure
+
+
+def action_history(lanes: pd.DataFrame) -> Figure | None:
+    """`lstm-td3` with and without past actions, a panel per length."""
+    pair = ("lstm-td3", "lstm-td3-no-action")
+    own = lanes[lanes["algorithm"].isin(pair)]
+    lengths = lengths_in(own)
+    names = [name for name in DISTURBANCES if (own["disturbance"] == name).any()]
+    if not lengths:
+        return None
+    figure = Figure(figsize=(2.6 * len(lengths) + 1, 3.6), layout="constrained")
+    panels = figure.subplots(1, len(lengths), sharey=True, squeeze=False)[0]
+    for axes, length in zip(panels, lengths, strict=True):
+        here = own[own["history_length"] == length]
+        _bars(axes, here, "disturbance", names, list(pair))
+        axes.set_title(f"l = {length}", fontsize=10)
+    panels[0].set_ylabel("normalised return")
+    panels[-1].legend(fontsize=8, loc="lower right")
+    return figure
+
+
+def generalisation(moved: pd.DataFrame) -> Figure | None:
+    """Agents trained on `random-sine` under each condition: a panel per length."""
+    lengths = [length for length in lengths_in(moved) if length]
+    if not lengths:
+        return None
+    conditions = list(dict.fromkeys(moved["tested_on"]))
+    figure = Figure(figsize=(7.0, 2.6 * len(lengths) + 0.9), layout="constrained")
+    panels = figure.subplots(len(lengths), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+    for axes, length in zip(panels, lengths, strict=True):
+        here = moved[moved["history_length"].isin([0, length])]
+        _bars(axes, here, "tested_on", conditions, agents_in(moved))
+        axes.set_ylabel(f"l = {length}\nnormalised return", fontsize=9)
+    panels[0].legend(fontsize=7, ncols=3, loc="lower left")
+    return figure
+
+
+def _bars(
+    axes: object, rows: pd.DataFrame, column: str, names: list[str], agents: list[str]
+) -> None:
+    """Bars of the agents side by side for each of ``names``."""
+    width = 0.8 / len(agents)
+    for k, agent in enumerate(agents):
+        found = rows[rows["algorithm"] == agent].groupby(column)["normalised"]
+        means, spread = found.mean(), found.std().fillna(0.0)
+        x = [index + width * (k + 0.5) - 0.4 for index, name in enumerate(names) if name in means]
+        y = np.array([means[name] for name in names if name in means])
+        error = np.array([spread[name] for name in names if name in means])
+        axes.bar(x, y, width, yerr=error, color=colour_of(agent), label=agent, error_kw={"lw": 0.8})
+    axes.axhline(1.0, color=GREY, lw=0.8)
+    axes.set_ylim(min(0.0, axes.get_ylim()[0]), 1.08)
+    labels = [name.split(":")[0] + (" σ = 1" if "sigma=1" in name else "") for name in names]
+    axes.set_xticks(range(len(names)), labels, rotation=30, ha="right", fontsize=8)
+    axes.grid(axis="y", color="#E4E4E4", lw=0.6)
+
+
+def draw_all(results: pathlib.Path, out: pathlib.Path) -> None:
+    """Every figure that the tables in ``results`` have rows for."""
+
+    def rows(name: str) -> pd.DataFrame:
+        path = results / f"{name}.parquet"
+        return current(pd.read_parquet(path)) if path.exists() else pd.DataFrame()
+
+    lanes, curves, moved = rows("pendulum"), rows("pendulum_curves"), rows("generalisation")
+    drawn = {
+        "pendulum": final_returns(lanes) if len(lanes) else None,
+        "pendulum_learning_curves": learning_curves(curves) if len(curves) else None,
+        "action_history": action_history(lanes) if len(lanes) else None,
+        "generalisation": generalisation(moved) if len(moved) else None,
+    }
+    for name, figure in drawn.items():
+        if figure is None:
+            print(f"missing: {name}: no rows of the current setting")
+        else:
+            save(figure, out, name)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--results", type=pathlib.Path, default=RESULTS)
+    parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
+    options = parser.parse_args(arguments)
+    draw_all(options.results, options.out)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
