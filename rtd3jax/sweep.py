@@ -6,6 +6,7 @@ side. The same command again trains what is missing; with more seeds, cells or s
 
 import argparse
 import collections
+import functools
 import signal
 import sys
 import threading
@@ -89,7 +90,8 @@ def _run(options: argparse.Namespace) -> int:
     news = "" if options.fresh else directory.plan()
     jobs = directory.jobs(strategy)
     if options.dry_run:
-        print(plan_text(directory.cells, directory.seeds, jobs, strategy, memory()))
+        say = functools.partial(print, file=sys.stderr, flush=True)
+        print(plan_text(directory.cells, directory.seeds, jobs, strategy, memory(), say))
         print(news, end="\n" if news else "")
         return 0
     # On a cluster its nodes, not this machine, must have the memory.

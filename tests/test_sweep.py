@@ -11,7 +11,7 @@ from rtd3jax import sweep
 from rtd3jax.agents.variants import ALGORITHMS
 from rtd3jax.config import Config
 from rtd3jax.envs import registry
-from rtd3jax.study import finish, presets, recorder, references
+from rtd3jax.study import finish, pace, presets, recorder, references
 from rtd3jax.study.plan import Cell, Grid, make_cells
 from rtd3jax.study.presets import PRESETS
 from rtd3jax.study.results import CURVES, EPISODES, read_table
@@ -132,11 +132,14 @@ def test_a_directory_that_is_no_study_is_left_alone(tmp_path, capsys):
     assert "is not empty and holds no study" in capsys.readouterr().err
 
 
-def test_dry_run_prints_the_plan(tmp_path, capsys):
+def test_dry_run_prints_the_plan(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(pace, "group_seconds", lambda jobs: 60.0 * (1 + jobs[0].program.tokens))
+    monkeypatch.setattr(pace, "workers", lambda: [None, None])
     assert sweep.main(["--preset", "rover", "--dry-run", "--out", str(tmp_path / "run")]) == 0
-    plan = capsys.readouterr().out
+    plan, said = capsys.readouterr()
     assert "18 cells × 5 seeds = 90 lanes" in plan and "programs to compile: 6" in plan
-    assert "MiB" in plan and "time: about" in plan
+    # 75 lanes of two minutes and 15 of td3, which has no window, of one: with two workers.
+    assert "MiB" in plan and "time: about 82.5 min" in plan and "timing 4 of 4" in said
 
 
 def test_presets_have_the_papers_cells():

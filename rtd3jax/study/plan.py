@@ -2,12 +2,9 @@
 
 import dataclasses
 import itertools
-import time
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
-
-import numpy as np
 
 from rtd3jax.agents.agent import make_part
 from rtd3jax.agents.networks import Network
@@ -16,6 +13,7 @@ from rtd3jax.envs.registry import make, parse_disturbance
 from rtd3jax.errors import UserError
 from rtd3jax.registries import AGENTS
 from rtd3jax.study.memory import job_bytes, lanes_at_once
+from rtd3jax.study.pace import study_seconds
 from rtd3jax.training.lanes import Job, workers
 from rtd3jax.training.run import make_jobs
 
@@ -139,7 +137,7 @@ class Cost:
         programs: to compile.
         state_bytes: of the largest lane's state.
         working_bytes: that the largest lane needs besides while it advances.
-        seconds: of computing, without compiling; a rough figure from operation counts.
+        seconds: of computing, without compiling; see `rtd3jax.study.pace`.
     """
 
     programs: int
@@ -148,18 +146,13 @@ class Cost:
     seconds: float
 
 
-def estimate(jobs: Sequence[Job], workers: int) -> Cost:
-    """Count programs, bytes from shapes, and time from operation counts."""
+def estimate(
+    jobs: Sequence[Job], strategy: str, say: Callable[[str], None] = lambda line: None
+) -> Cost:
+    """Count programs, bytes from shapes, and time some programs; ``say`` takes lines meanwhile."""
     sizes = job_bytes(jobs)
     state, work = (max(column) for column in zip(*sizes.values(), strict=True))
-    rate = _matmul_rate(workers)
-    operations = sum(
-        update_flops(job.program.config) * job.program.config.total_steps for job in jobs
-    )
-    steps = sum(job.program.config.total_steps for job in jobs)
-    # Half the rate of a large product, and 0.2 ms for what is not products, were seen on CPUs.
-    seconds = (operations / (0.5 * rate) + 2e-4 * steps) / workers
-    return Cost(len(sizes), state, work, seconds)
+    return Cost(len(sizes), state, work, study_seconds(jobs, strategy, update_flops, say))
 
 
 def update_flops(config: Config) -> float:
@@ -226,22 +219,17 @@ def update_flops(config: Config) -> float:
 _ROLES = ("actor", "critic")
 
 
-def _matmul_rate(threads: int) -> float:
-    """Operations per second and core of a large float32 product."""
-    size = 768
-    a = np.ones((size, size), np.float32)
-    began = time.perf_counter()
-    for _ in range(4):
-        a @ a
-    return 4 * 2.0 * size**3 / (time.perf_counter() - began) / threads
-
-
 def plan_text(
-    cells: Sequence[Cell], seeds: Sequence[int], jobs: Sequence[Job], strategy: str, memory: int
+    cells: Sequence[Cell],
+    seeds: Sequence[int],
+    jobs: Sequence[Job],
+    strategy: str,
+    memory: int,
+    say: Callable[[str], None] = lambda line: None,
 ) -> str:
     """What a sweep will do and what it will cost, for people; ``memory`` in bytes."""
     count = len(workers())
-    cost = estimate(jobs, count)
+    cost = estimate(jobs, strategy, say)
     fit = lanes_at_once(jobs, strategy, count, memory)
     waits = f"; {len(jobs) - fit:,} wait for their turn" if fit < len(jobs) else ""
     lines = [f"{len(cells)} cells × {len(seeds)} seeds = {len(jobs)} lanes"]
@@ -260,7 +248,7 @@ def plan_text(
         f"{' of a device' if strategy == 'vmap' else ''}: {min(fit, len(jobs)):,}{waits}",
         f"time: about {_duration(cost.seconds)} on {count} "
         f"{'cores' if workers()[0].platform == 'cpu' else 'devices'}, "
-        "by a count of operations, without compiling",
+        "as measured just now, without compiling",
     ]
     return "\n".join(lines)
 

@@ -275,12 +275,17 @@ def _advanced(group: Group, state: LaneState, step: int) -> None:
     group.state, group.step = state, step
 
 
+def stacked(lanes: Sequence[Lane], device: jax.Device) -> Lane:
+    """The lanes on a device: one as it is, several side by side."""
+    one = len(lanes) == 1
+    lane = lanes[0] if one else jax.tree.map(lambda *leaves: jnp.stack(leaves), *lanes)
+    return jax.device_put(lane, device)
+
+
 def _chunk(group: Group, device: jax.Device, rates: dict[Any, float]) -> None:
     program, width = group.jobs[0].program, len(group.jobs)
-    lanes = [job.lane for job in group.jobs]
-    lane = lanes[0] if width == 1 else jax.tree.map(lambda *leaves: jnp.stack(leaves), *lanes)
-    lane = jax.device_put(lane, device)
-    init, advance = _compiled(program, lane, width > 1, device)
+    lane = stacked([job.lane for job in group.jobs], device)
+    init, advance = compiled(program, lane, width > 1, device)
     state = init(lane) if group.state is None else jax.device_put(group.state, device)
     rate = rates.get((program, width))
     steps = _FIRST_CHUNK if rate is None else max(1, int(rate * CHUNK_SECONDS))
@@ -342,7 +347,7 @@ def _let_go() -> None:
         _programs.clear()
 
 
-def _compiled(program: Program, lane: Lane, batched: bool, device: jax.Device) -> tuple[Any, Any]:
+def compiled(program: Program, lane: Lane, batched: bool, device: jax.Device) -> tuple[Any, Any]:
     """``init`` and ``advance``, compiled once for equal programs."""
     key = (program, _structure(lane), batched, device)
     if key not in _programs:

@@ -29,13 +29,13 @@ def train():
 
 
 def test_letting_programs_go_all_the_time_changes_no_number(monkeypatch, always_full):
-    compiled, let_go = lanes._compiled, []
+    compiled, let_go = lanes.compiled, []
 
     def after_letting_go(*arguments):
         let_go.append(programs.make_room())
         return compiled(*arguments)
 
-    monkeypatch.setattr(lanes, "_compiled", after_letting_go)
+    monkeypatch.setattr(lanes, "compiled", after_letting_go)
     often = train()
     assert len(let_go) > 2 and all(let_go)
     monkeypatch.undo()
@@ -95,7 +95,7 @@ def test_equal_environments_share_a_program_and_copies_are_warned_of(monkeypatch
 
     def compiled(env, **changes):
         config = rtd.Config("td3", **SETTINGS | changes)
-        lanes._compiled(make_program(env, config, 1, (1,)), lane, False, device)
+        lanes.compiled(make_program(env, config, 1, (1,)), lane, False, device)
         return len(lanes._programs)
 
     assert [compiled(Equal()) for _ in range(4)] == [1] * 4

@@ -1,0 +1,149 @@
+"""How long a study will take here: its own programs, run for a second each.
+
+A count of operations knows neither this machine nor what else runs on it. So some of a study's
+programs are compiled and timed, as many lanes side by side as there are workers; the time of the
+others follows from theirs by their operations.
+"""
+
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rtd3jax.config import Config
+from rtd3jax.training.lanes import Job, compiled, stacked, workers
+from rtd3jax.training.loop import Program
+
+MOST_PROGRAMS = 4
+"""That are timed: each costs its compilation."""
+_SECONDS = 1.0
+
+
+def study_seconds(
+    jobs: Sequence[Job],
+    strategy: str,
+    operations: Callable[[Config], float],
+    say: Callable[[str], None] = lambda line: None,
+) -> float:
+    """Seconds that the jobs need with all workers, without compiling.
+
+    Args:
+        jobs: a lane each.
+        strategy: ``map``: a worker trains lane after lane; ``vmap``: its share of a program's lanes
+            side by side.
+        operations: those of an environment step of a configuration, by which programs that are
+            not timed are placed among those that are.
+        say: takes a line before each measurement.
+    """
+    devices = len(workers())
+    lanes: dict[Program, list[Job]] = {}
+    for job in jobs:
+        lanes.setdefault(job.program, []).append(job)
+    programs = sorted(lanes, key=lambda program: operations(program.config))
+    count = min(MOST_PROGRAMS, len(programs))
+    places = sorted({round(k * (len(programs) - 1) / max(1, count - 1)) for k in range(count)})
+    timed: dict[Program, float] = {}
+    for number, place in enumerate(places, 1):
+        program = programs[place]
+        config = program.config
+        say(f"timing {number} of {len(places)}: {config.algorithm} l={config.tokens}")
+        width = 1 if strategy == "map" else -(-len(lanes[program]) // devices)
+        timed[program] = group_seconds(lanes[program][:width])
+    whole = _filled_in(programs, timed, operations)
+    if strategy == "map":
+        return sum(whole[job.program] for job in jobs) / devices
+    return sum(whole.values())
+
+
+def group_seconds(jobs: Sequence[Job]) -> float:
+    """Seconds of a worker for the lanes side by side, while the other workers do the same."""
+    program = jobs[0].program
+    steps, evaluations = zip(*_on_all_workers(jobs), strict=True)
+    learning = max(0, program.config.total_steps - program.config.learning_starts)
+    return float(np.mean(steps)) * learning + float(np.mean(evaluations)) * program.evaluations
+
+
+def _on_all_workers(jobs: Sequence[Job]) -> list[tuple[float, float]]:
+    """Seconds of a step that learns, and of an evaluation, for each worker."""
+    devices = workers()
+    together = threading.Barrier(len(devices))
+    found: dict[int, tuple[float, float]] = {}
+    errors: list[BaseException] = []
+
+    def work(number: int, device: jax.Device) -> None:
+        try:
+            with jax.debug_nans(False):
+                found[number] = _timed(jobs, device, together)
+        except BaseException as error:
+            errors.append(error)
+            together.abort()
+
+    threads = [
+        threading.Thread(target=work, args=(number, device), daemon=True)
+        for number, device in enumerate(devices)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    if errors:
+        raise next(
+            (e for e in errors if not isinstance(e, threading.BrokenBarrierError)), errors[0]
+        )
+    return [found[number] for number in range(len(devices))]
+
+
+def _timed(
+    jobs: Sequence[Job], device: jax.Device, together: threading.Barrier
+) -> tuple[float, float]:
+    program, config = jobs[0].program, jobs[0].program.config
+    lane = stacked([job.lane for job in jobs], device)
+    init, advance = compiled(program, lane, len(jobs) > 1, device)
+    state = init(lane)
+
+    def seconds(start: int, stop: int) -> float:
+        nonlocal state
+        began = time.perf_counter()
+        state = advance(lane, state, jnp.int32(start), jnp.int32(stop))
+        jax.block_until_ready(state)
+        return time.perf_counter() - began
+
+    # Rows of zeros take as long as what an environment gave. Steps are a whole number of updates.
+    start = config.learning_starts
+    block = config.update_every * config.policy_delay
+    seconds(start, start + block)
+    together.wait()
+    done, spent = 0, 0.0
+    while spent < _SECONDS:
+        # Between two evaluations, which are timed by themselves.
+        first = start + (-start) % config.eval_every
+        length = min(block, max(1, config.eval_every - 1))
+        spent += seconds(first, first + length)
+        done += length
+        block *= 2
+    step = spent / done
+    last = config.eval_every - 1
+    both = seconds(last, last + 1)
+    return step, max(0.0, both - step)
+
+
+def _filled_in(
+    programs: Sequence[Program],
+    timed: Mapping[Program, float],
+    operations: Callable[[Config], float],
+) -> dict[Program, float]:
+    """A lane's seconds of every program: between two that were timed, in proportion."""
+
+    def work(program: Program) -> float:
+        return operations(program.config)
+
+    known = sorted(timed, key=work)
+    a_step = [timed[program] / program.config.total_steps for program in known]
+    steps = np.interp([work(p) for p in programs], [work(p) for p in known], a_step)
+    return {
+        program: timed.get(program, float(step) * program.config.total_steps)
+        for program, step in zip(programs, steps, strict=True)
+    }

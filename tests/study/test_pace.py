@@ -1,0 +1,52 @@
+"""The time that a plan names is measured: of some programs, and in proportion of the others."""
+
+import numpy as np
+import pytest
+
+import rtd3jax as rtd
+from rtd3jax.study import pace
+from rtd3jax.training.run import make_jobs
+
+
+def _jobs(algorithm, seeds=2, **changes):
+    fields = dict(total_steps=1_000, hidden_size=4, batch_size=4, learning_starts=200)
+    config = rtd.Config(algorithm, **{**fields, "eval_every": 500, "eval_episodes": 1, **changes})
+    return make_jobs(rtd.make("rover", "ar1-slip"), config, list(range(seeds)))
+
+
+def test_what_is_not_timed_lies_between_what_is(monkeypatch):
+    jobs = [job for length in range(1, 8) for job in _jobs("lstm-td3", history_length=length)]
+    asked = []
+
+    def seconds(group):
+        asked.append(group[0].program.tokens)
+        return 10.0 * group[0].program.tokens
+
+    monkeypatch.setattr(pace, "group_seconds", seconds)
+    monkeypatch.setattr(pace, "workers", lambda: [None] * 4)
+    operations = lambda config: float(config.tokens)  # noqa: E731
+    assert pace.study_seconds(jobs, "map", operations) == pytest.approx(2 * 280 / 4)
+    assert len(asked) == pace.MOST_PROGRAMS and {1, 7} <= set(asked)
+    # Side by side, each of a program's lanes has a worker of its own here.
+    assert pace.study_seconds(jobs, "vmap", operations) == pytest.approx(280)
+
+
+def test_a_lane_is_timed_without_its_random_steps(monkeypatch):
+    monkeypatch.setattr(pace, "_SECONDS", 0.05)
+    (job, _), told = _jobs("td3"), []
+    seconds = pace.study_seconds([job], "map", lambda config: 1.0, told.append)
+    assert np.isfinite(seconds) and seconds > 0.0
+    assert told == ["timing 1 of 1: td3 l=0"]
+    (untrained, _) = _jobs("td3", total_steps=1_000, learning_starts=1_000)
+    monkeypatch.setattr(pace, "_timed", lambda *_: (1.0, 5.0))
+    with_updates, without = pace.group_seconds([job]), pace.group_seconds([untrained])
+    assert (with_updates, without) == (800 + 2 * 5, 2 * 5)
+
+
+def test_what_fails_while_it_is_timed_is_raised(monkeypatch):
+    def fail(jobs, device, together):
+        raise rtd.UserError("no such device")
+
+    monkeypatch.setattr(pace, "_timed", fail)
+    with pytest.raises(rtd.UserError, match="no such device"):
+        pace.group_seconds(_jobs("td3"))
