@@ -3,7 +3,8 @@
 Usage: taskset -c 0 python experiments/benchmarks/latency.py [--quick] [--out DIR]
 
 Six agents at l = 10 and H = 128 with untrained weights, which cost what trained ones do, on the
-pendulum's observation. A repeat plays 200 steps and takes their median; the figure is the least
+pendulum's observation; the recurrent ones also with a carry that runs on, whose cost does not
+depend on l. A repeat plays 200 steps and takes their median; the figure is the least
 median of all repeats, because a busy machine only ever adds to it. Observations come as numpy
 arrays and actions are waited for, as on a robot.
 """
@@ -38,7 +39,7 @@ OBSERVATIONS, ACTIONS = 3, 1
 STEPS = 200
 
 
-def policy_of(algorithm, length, width):
+def policy_of(algorithm, length, width, acting):
     length = 0 if algorithm == "td3" else length
     network = make_part(AGENTS[algorithm], "actor", "lstm", OBSERVATIONS, ACTIONS, width)
     actor = init_network(jax.random.key(0), network)
@@ -51,6 +52,7 @@ def policy_of(algorithm, length, width):
         tokens=length,
         observation_size=OBSERVATIONS,
         action_shape=(ACTIONS,),
+        acting=acting,
     )
 
 
@@ -129,8 +131,9 @@ def measure(agents, length, width, repeats):
     with tempfile.TemporaryDirectory() as name:
         directory = pathlib.Path(name)
         players = {
-            (algorithm, form): make(policy_of(algorithm, length, width), directory)
+            (algorithm, acting, form): make(policy_of(algorithm, length, width, acting), directory)
             for algorithm in agents
+            for acting in ("window", "carry")[: 1 + AGENTS[algorithm].has_window]
             for form, make in FORMS.items()
         }
         for step in players.values():
@@ -140,20 +143,27 @@ def measure(agents, length, width, repeats):
             for key, step in players.items():
                 best[key] = min(best[key], median_microseconds(step, observations))
     return [
-        {"agent": agent, "form": form, "history_length": length, "width": width, "us": round(us, 1)}
-        for (agent, form), us in best.items()
+        {
+            "agent": agent,
+            "acting": acting,
+            "form": form,
+            "history_length": length,
+            "width": width,
+            "us": round(us, 1),
+        }
+        for (agent, acting, form), us in best.items()
     ]
 
 
 def report(rows, repeats):
-    table = {(row["agent"], row["form"]): row["us"] for row in rows}
+    table = {(_name(row), row["form"]): row["us"] for row in rows}
     first = rows[0]
     lines = [
         "| agent | " + " | ".join(FORMS) + " |",
         "|---" * (1 + len(FORMS)) + "|",
         *(
-            f"| `{agent}` | " + " | ".join(f"{table[agent, form]:.0f}" for form in FORMS) + " |"
-            for agent in dict.fromkeys(row["agent"] for row in rows)
+            f"| {agent} | " + " | ".join(f"{table[agent, form]:.0f}" for form in FORMS) + " |"
+            for agent in dict.fromkeys(map(_name, rows))
         ),
     ]
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else "all"
@@ -167,6 +177,10 @@ def report(rows, repeats):
         f"numpy {np.__version__}, Python {platform.python_version()}.\n\n"
         "Command: `taskset -c 0 python experiments/benchmarks/latency.py`\n"
     )
+
+
+def _name(row):
+    return f"`{row['agent']}`" + (", carry runs on" if row["acting"] == "carry" else "")
 
 
 def _processor():

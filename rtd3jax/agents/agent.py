@@ -82,9 +82,15 @@ class Agent:
         """The learner's state at the start; its ``actor`` is the actor's parameters."""
         return self.learner.init(key, self.networks)
 
+    @property
+    def stores_carry(self) -> bool:
+        """Whether replay keeps the behaviour actor's carries: for the critics, or for segments."""
+        from_carries = self.has_running_carry and self.config.replay == "segments"
+        return self.variant.stores_carry or from_carries
+
     def empty_replay(self) -> Replay:
         """The ring in which the agent's transitions are kept."""
-        carry = self.acting.zero_carry(1) if self.variant.stores_carry else None
+        carry = self.acting.zero_carry(1) if self.stores_carry else None
         return empty_replay(self.config.capacity, self.observation_size, self.action_size, carry)
 
     def zero_carry(self) -> Carry | None:
@@ -104,7 +110,7 @@ class Agent:
         carry = running
         if carry is None and self.variant.stores_carry:
             carry = carry_before(self.acting, actor, window)
-        kept = carry if self.variant.stores_carry else None
+        kept = carry if self.stores_carry else None
         return act(self.acting, actor, window, carry), kept
 
     def carry_after(
@@ -134,7 +140,13 @@ class Agent:
         config = self.config
         rows = replay, key, count, config.batch_size, config.tokens, history_length
         if config.replay == "segments":
-            return sample_segments(*rows, config.segment_steps, config.burn_in_gradient)
+            readers = {(True, False): "critic", (False, True): "actor", (True, True): "both"}
+            return sample_segments(
+                *rows,
+                config.segment_steps,
+                config.burn_in_gradient,
+                carries_for=readers.get((self.variant.stores_carry, config.runs_on), "none"),
+            )
         return sample(*rows)
 
     def update(

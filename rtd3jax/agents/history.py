@@ -9,6 +9,8 @@ Shapes: ``C`` capacity of the ring, ``L`` past tokens, ``B`` batch, ``M`` segmen
 ``O`` and ``A`` sizes of an observation and an action.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -65,6 +67,10 @@ class Segment:
             step kept, and the first that the history length lets in.
         observation: [B, O], the current observation.
         previous_action: [B, A], the action before it; zero at an episode's first step.
+        begins: bool [M], whether the burn-in's first token is an episode's first.
+        start: the behaviour actor's carry before the burn-in's first token, leaves [M, ...], from
+            which an actor goes on that acts with a running carry (Kapturowski et al., 2019, have
+            both a stored state and a burn-in); None where histories begin with nothing.
         following: whether the current step is the one after each of the m steps.
         burn_in_gradient: whether a gradient flows back into the burn-in.
     """
@@ -73,6 +79,8 @@ class Segment:
     starts: jax.Array
     observation: jax.Array
     previous_action: jax.Array
+    begins: jax.Array
+    start: Any
     following: bool = struct.field(pytree_node=False)
     burn_in_gradient: bool = struct.field(pytree_node=False)
 
@@ -197,6 +205,8 @@ def segment_at(
         starts=starts,
         observation=flat(steps.observation[tokens:]),
         previous_action=flat(steps.previous_action[tokens:]),
+        begins=ages[slots[0]] == 0,
+        start=None,
         following=False,
         burn_in_gradient=burn_in_gradient,
     )

@@ -257,6 +257,9 @@ def apply_network(
 
 def act(actor: Network, params: Params, history: History, carry: Carry | None = None) -> jax.Array:
     """The deterministic action [B, A] of an actor, in half ranges: tanh of the output."""
+    if isinstance(history, Segment):
+        output = _apply_to_segment(actor, params, history, None, carry, history.start)
+        return jnp.tanh(output)
     return jnp.tanh(apply_network(actor, params, history, carry=carry))
 
 
@@ -275,22 +278,30 @@ def advance(
     return network.apply({"params": params}, window, action, carry, method="advance")
 
 
-def segment_carries(network: Network, params: Params, segment: Segment) -> tuple[Carry, Carry]:
-    """The carries, leaves [B, ...], before and after the token of each of the segment's steps."""
+def segment_carries(
+    network: Network, params: Params, segment: Segment, start: Carry | None = None
+) -> tuple[Carry, Carry]:
+    """The carries, leaves [B, ...], before and after the token of each of the segment's steps.
+
+    ``start`` is the carry before the burn-in's first token; by default the history begins there.
+    """
     tokens = past_tokens(network.reads.memory, segment.steps)
     burn_in = tokens.shape[0] - segment.length
+    starts = segment.starts
+    if start is not None:
+        starts = starts.at[0].set(segment.begins)
 
     def carries(params: Params, carry: Carry | None, part: slice) -> Carry:
-        inputs = carry, tokens[part], segment.starts[part]
+        inputs = carry, tokens[part], starts[part]
         return network.apply({"params": params}, *inputs, method="carries")
 
     own = slice(burn_in, None)
     if segment.burn_in_gradient:
-        through = carries(params, None, slice(None))
+        through = carries(params, start, slice(None))
         last = jax.tree.map(lambda leaf: leaf[burn_in - 1], through)
         after = jax.tree.map(lambda leaf: leaf[own], through)
     else:
-        through = carries(jax.lax.stop_gradient(params), None, slice(burn_in))
+        through = carries(jax.lax.stop_gradient(params), start, slice(burn_in))
         last = jax.tree.map(lambda leaf: leaf[-1], through)
         after = carries(params, last, own)
 
@@ -308,18 +319,20 @@ def _apply_to_segment(
     segment: Segment,
     action: jax.Array | None,
     carry: Carry | None,
+    start: Carry | None = None,
 ) -> jax.Array:
     """`apply_network`: one pass over the tokens, then one step of the memory for all B at once."""
     recorded = action is None and not segment.following
     if recorded:
         action = segment.action
     if network.reads.memory and carry is None:
+        before, after = segment_carries(network, params, segment, start)
         if recorded:  # the current token is one of the segment's own, already passed
-            carries = segment_carries(network, params, segment)
+            carries = before, after
             return _output(
                 network, params, segment.present, action, *carries, method="from_carries"
             )
-        carry = carry_before(network, params, segment)
+        carry = after if segment.following else before
     return _output(network, params, segment.present, action, carry)
 
 

@@ -294,6 +294,8 @@ def sample_segments(
     history_length: jax.Array | int,
     length: int,
     burn_in_gradient: bool,
+    *,
+    carries_for: str = "critic",
 ) -> Batch:
     """As `sample`, but B / m stretches of m consecutive steps, their first steps uniform.
 
@@ -306,10 +308,13 @@ def sample_segments(
         history_length: l <= L, steps of the burn-in that may be read.
         length: m.
         burn_in_gradient: whether a gradient flows back into the burn-in.
+        carries_for: who reads the ring's carries, if it keeps any: the ``critic`` of `Batch`, the
+            ``actor`` that goes on with them, or ``both``.
     """
     oldest = jnp.maximum(count - replay.transitions.reward.shape[0], 0)
     first = jax.random.randint(key, (batch_size // length,), oldest, count - length + 1, jnp.int32)
-    return gather_segments(replay, first, count, tokens, history_length, length, burn_in_gradient)
+    rows = replay, first, count, tokens, history_length, length, burn_in_gradient
+    return gather_segments(*rows, carries_for=carries_for)
 
 
 def gather_segments(
@@ -320,6 +325,8 @@ def gather_segments(
     history_length: jax.Array | int,
     length: int,
     burn_in_gradient: bool,
+    *,
+    carries_for: str = "critic",
 ) -> Batch:
     """The batch of the stretches that begin at these numbers (int32 [M]); see `sample_segments`.
 
@@ -331,7 +338,11 @@ def gather_segments(
     )
     slot, action = slots.reshape(-1), segment.action
     number = flat(first[None, :] + jnp.arange(length, dtype=jnp.int32)[:, None])
-    carry, next_carry = _stored_carries(replay, number, kept.age[slot])
+    carry = next_carry = None
+    if carries_for in ("critic", "both"):
+        carry, next_carry = _stored_carries(replay, number, kept.age[slot])
+    if carries_for in ("actor", "both") and replay.carries is not None:
+        segment = dataclasses.replace(segment, start=_carry_at(replay.carries, first - tokens))
     following = dataclasses.replace(
         segment,
         observation=kept.next_observation[slot],

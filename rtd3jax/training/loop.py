@@ -342,11 +342,12 @@ def make_program(
     """The program of lanes that differ in nothing but traced numbers.
 
     With ``window``, lanes may differ in their history length too, up to that: the window's arrays
-    are as long, and what is beyond a lane's own length does not exist for it.
+    are as long, and what is beyond a lane's own length does not exist for it. Segments, which begin
+    with a stored carry, have the burn-in of their own configuration.
     """
     defaults = {name: getattr(Config, name) for name in traced_fields()}
     static = dataclasses.replace(config, **defaults)
-    if window is not None and config.has_window:
+    if window is not None and config.has_window and config.replay == "windows":
         static = dataclasses.replace(static, history_length=window)
     return Program(env, static, observation_size, action_shape)
 

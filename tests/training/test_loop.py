@@ -9,8 +9,8 @@ import pytest
 from flax import struct
 from gymnax.environments import environment, spaces
 
-from rtd3jax.agents.networks import carry_before
-from rtd3jax.agents.replay import gather
+from rtd3jax.agents.networks import act, carry_before
+from rtd3jax.agents.replay import gather, gather_segments
 from rtd3jax.config import Config
 from rtd3jax.training.loop import make_lane, make_program
 
@@ -115,6 +115,27 @@ def test_stored_carries_are_the_actors_own(lane):
     for stored, window in ((batch.carry, batch.window), (batch.next_carry, batch.next_window)):
         for got, want in zip(stored, carry_before(network, actor, window), strict=True):
             np.testing.assert_allclose(got, want, atol=1e-6)
+
+
+@pytest.mark.parametrize("burn_in_gradient", [True, False])
+def test_segments_go_on_from_the_carry_that_was_stored(lane, burn_in_gradient):
+    """While the actor stays the same, a short burn-in from there is as good as a whole episode."""
+    program, _, state = lane
+    if program.config.acting == "window":
+        pytest.skip("no carry runs on")
+    count, length, burn_in = jnp.int32(STEPS), 3, 2
+    first = jnp.arange(STEPS - length, dtype=jnp.int32)
+    rows = state.replay, first, count, burn_in, burn_in, length, burn_in_gradient
+    stored = gather_segments(*rows, carries_for="actor")
+    number = (first[None, :] + jnp.arange(length)[:, None]).reshape(-1)
+    whole = gather(state.replay, number, count, program.tokens, program.tokens)
+    actor, network = state.learner.actor, program.agent.acting
+    for name in ("window", "next_window"):
+        want = act(network, actor, getattr(whole, name))
+        np.testing.assert_allclose(act(network, actor, getattr(stored, name)), want, atol=1e-6)
+        from_nothing = gather_segments(*rows, carries_for="critic")
+        short = act(network, actor, getattr(from_nothing, name))
+        assert np.abs(np.asarray(short - want)).max() > 1e-4
 
 
 def test_the_last_evaluation_is_at_the_end(lane):
