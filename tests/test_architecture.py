@@ -13,6 +13,7 @@ LAYERS = {
     "files": 1,
     "machine": 1,
     "programs": 1,
+    "switches": 1,
     "versions": 1,
     "registries": 1,
     "config": 2,

@@ -5,6 +5,7 @@ from typing import Any
 import gymnasium
 
 from rtd3jax.errors import UserError
+from rtd3jax.switches import check_switches
 
 METHODS = ("reset", "step", "action_space")
 """Without these nothing is a gymnax environment."""
@@ -16,8 +17,10 @@ def parameters_of(env: Any, params: Any = None) -> Any:
     Every function that takes an environment calls this first.
 
     Raises:
-        UserError: for what is no gymnax >= 1.0 environment.
+        UserError: for what is no gymnax >= 1.0 environment, or under one of JAX's switches with
+            which nothing here can work.
     """
+    check_switches()
     check_gymnax(env)
     if params is not None:
         return params

@@ -14,6 +14,7 @@ from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
 from rtd3jax.files import user_path
 from rtd3jax.policy import Policy
+from rtd3jax.switches import check_compiling
 from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.lanes import (
     Group,
@@ -228,6 +229,7 @@ def make_jobs(
 
     With ``window``, jobs of shorter history lengths share the program of that length.
     """
+    check_compiling()
     params = parameters_of(env, params)
     warn_if_untrained(config)
     interface = describe(env, params)
