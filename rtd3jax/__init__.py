@@ -1,5 +1,6 @@
 """Recurrent TD3 agents for plants whose disturbance is hidden and evolves."""
 
+import rtd3jax.system.switches  # noqa: F401 - first: it imports gymnax where switches forbid that
 from rtd3jax.agents.agent import Agent, count_parameters, make_agent
 from rtd3jax.agents.learners import register_learner
 from rtd3jax.agents.memory import Memory, register_memory

@@ -27,6 +27,9 @@ EPISODES = 8
 LONGEST_EPISODE = 1_000
 """Steps after which an episode is no longer followed."""
 
+LARGEST, SMALLEST = 1e2, 1e-3
+"""Root mean squares between which a network learns from a number as it stands."""
+
 _DIGITS = 1e-5
 """Relative error that two compilations of one program may have."""
 
@@ -40,7 +43,8 @@ class Finding:
 
     Attributes:
         kind: ``interface`` (what every training refuses), ``dtype``, ``space``, ``vmap``,
-            ``finite``, ``pure``, ``leak``, ``final-observation``, ``time-limit``.
+            ``finite``, ``pure``, ``leak``, ``final-observation``, ``time-limit``,
+            ``scale``.
         problem: what was seen.
         remedy: what to do.
         advice: whether the environment is sound and yet likely to be learned badly.
@@ -172,6 +176,7 @@ def _played(
         )
         return
     yield from _finite(record)
+    yield from _scales(record)
     yield from _time_limits(record, limit, steps)
     yield from _final_observations(record)
     impure = list(_pure(env, params, record, seed))
@@ -262,6 +267,35 @@ def _finite(record: _Record) -> Iterator[Finding]:
         if not good.all():
             step = int(np.argmin(good.all(0)))
             yield Finding("finite", f"the {what} of step {step} is not finite", remedy)
+
+
+def _scales(record: _Record) -> Iterator[Finding]:
+    """Sizes beside which others vanish, or which vanish beside others."""
+
+    def far(size: np.ndarray | float) -> np.ndarray:
+        size = np.asarray(size)
+        return ((size > LARGEST) & (size < np.inf)) | ((size > 0) & (size < SMALLEST))
+
+    seen = record.final.reshape(-1, record.final.shape[-1]).astype(np.float64)
+    sizes = np.sqrt(np.mean(seen**2, axis=0))
+    odd = np.flatnonzero(far(sizes))
+    if odd.size:
+        few = ", ".join(f"element {k} {sizes[k]:.1g}" for k in odd[:3])
+        more = f", and {odd.size - 3} more" if odd.size > 3 else ""
+        yield Finding(
+            "scale",
+            f"the observation's sizes are far from one: {few}{more}",
+            "networks read it as it is: divide each element by its usual size",
+            advice=True,
+        )
+    size = float(np.sqrt(np.mean(record.reward.astype(np.float64) ** 2)))
+    if far(size):
+        yield Finding(
+            "scale",
+            f"rewards of {size:.1g} are far from one",
+            f"train with reward_scale={1 / size:.1g}; returns are reported without it",
+            advice=True,
+        )
 
 
 def _pure(env: EnvironmentLike, params: object, record: _Record, seed: int) -> Iterator[Finding]:

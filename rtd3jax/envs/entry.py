@@ -6,6 +6,7 @@ import gymnasium
 
 from rtd3jax.errors import UserError
 from rtd3jax.protocols import EnvironmentLike
+from rtd3jax.system.switches import check_switches
 
 METHODS = ("reset", "step", "action_space")
 """Without these nothing is a gymnax environment."""
@@ -17,8 +18,15 @@ def parameters_of(env: EnvironmentLike, params: object = None) -> Any:
     Every function that takes an environment calls this first.
 
     Raises:
-        UserError: for what is no gymnax >= 1.0 environment.
+        UserError: for what is no gymnax >= 1.0 environment, or under one of JAX's switches with
+            which nothing here can work.
     """
+    check_switches()
+    return own_parameters(env, params)
+
+
+def own_parameters(env: EnvironmentLike, params: object = None) -> Any:
+    """`parameters_of` where nothing is computed, such as at an import: under any switch."""
     check_gymnax(env)
     if params is not None:
         return params

@@ -22,7 +22,7 @@ from rtd3jax.envs.disturbed import (
     disturb,
     sequence,
 )
-from rtd3jax.envs.entry import check_gymnax, parameters_of
+from rtd3jax.envs.entry import check_gymnax, own_parameters
 from rtd3jax.envs.interface import describe
 from rtd3jax.envs.processes.faults import (
     Delay,
@@ -217,7 +217,7 @@ def _check_extras(
 ) -> None:
     """Raise UserError, naming the argument of `register`, for what the environment has not."""
     positive, reward_from_observation, with_params, about = extras
-    params = parameters_of(env)
+    params = own_parameters(env)
     fields = list(_settable(params))
     wanted = positive
     if about.drawing is not None:
@@ -259,7 +259,7 @@ def _named_processes(
                 "letters, digits, '-', '.' and '_'"
             )
         channel, process = value if isinstance(value, tuple) else ("observation", value)
-        params = parameters_of(env)
+        params = own_parameters(env)
         if channel in CHANNELS or not isinstance(getattr(params, channel, None), Process):
             if tried:
                 disturb(env, process, channel)

@@ -25,6 +25,10 @@ _HEADROOM = 0.8
 """Share of the memory that lanes may take: programs, tables and the rest need some too."""
 
 
+PROCESS_BYTES = 1_150 * 2**20
+"""Of a process before it has a lane: Python, JAX, its compiled programs, tables and pictures."""
+
+
 def state_bytes(job: Job) -> int:
     """Bytes that a lane keeps: parameters, optimisers, replay, carries, environment; exact."""
 
@@ -97,6 +101,12 @@ def lanes_at_once(jobs: Sequence[Job], strategy: str, workers: int, memory: int)
 
 
 def memory() -> int:
-    """Bytes of the device's own memory, or of what this process may use of the machine's."""
+    """Bytes of the device's own memory, or of what this process may use of the machine's.
+
+    Of the latter so much that the share of it that lanes may take leaves room for the process.
+    """
     limit = (workers()[0].memory_stats() or {}).get("bytes_limit")
-    return limit or memory_limit()
+    if limit:
+        return limit
+    own = memory_limit()
+    return max(0, min(own, int((own - PROCESS_BYTES) / _HEADROOM)))

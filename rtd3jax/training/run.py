@@ -15,6 +15,7 @@ from rtd3jax.errors import UserError
 from rtd3jax.policies.trained import Policy
 from rtd3jax.protocols import EnvironmentLike
 from rtd3jax.system.files import user_path
+from rtd3jax.system.switches import check_compiling
 from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.lanes import (
     Group,
@@ -239,6 +240,7 @@ def make_jobs(
 
     With ``window``, jobs of shorter history lengths share the program of that length.
     """
+    check_compiling()
     params = parameters_of(env, params)
     warn_if_untrained(config)
     check_segments(config, _horizon(params))

@@ -1,5 +1,7 @@
 """One environment that is broken in one way, for every finding; and sound ones that pass."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -303,6 +305,31 @@ def test_a_time_limit_of_one_step_is_a_warning(recwarn):
     recwarn.clear()
     check_env(Bandit())  # nothing follows its end, and nothing is bootstrapped
     check_env(Good())
+    assert not [w for w in recwarn if w.category is UserWarning]
+
+
+def test_scales_that_will_hurt_are_a_warning(recwarn):
+    class Scaled(Good):
+        def reset_env(self, key, params):
+            observation, state = super().reset_env(key, params)
+            return observation * jnp.array([1.0, 1e4, 1e-4, 0.0]), state
+
+        def step_env(self, key, state, action, params):
+            observation, state, reward, *rest = super().step_env(key, state, action, params)
+            return observation * jnp.array([1.0, 1e4, 1e-4, 0.0]), state, 1e-3 * reward, *rest
+
+        def observation_space(self, params):
+            return spaces.Box(-jnp.inf, jnp.inf, (4,))
+
+    check_env(Scaled())
+    seen, rewards = [str(w.message) for w in recwarn if w.category is UserWarning]
+    assert re.search(r"far from one: element 1 \de\+03, element 2 \de-05; networks", seen)
+    assert re.search(
+        r"rewards of 0.000\d are far from one; train with reward_scale=\de\+03", rewards
+    )
+    recwarn.clear()
+    check_env(Good())
+    check_env(make("pendulum", "none", max_steps_in_episode=12))
     assert not [w for w in recwarn if w.category is UserWarning]
 
 

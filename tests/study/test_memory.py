@@ -50,6 +50,15 @@ def test_lanes_that_do_not_fit_wait_for_their_turn():
         memory.lanes_at_once(jobs, "map", 2, kept)
 
 
+def test_a_small_limit_leaves_room_for_the_process(monkeypatch):
+    """With 3 GB four replays of 410 MB were planned, a fifth comes and goes: it was killed."""
+    for limit, lanes in ((3_000_000_000, 1_794_137_600), (64_000_000_000, 51_200_000_000)):
+        monkeypatch.setattr(memory, "memory_limit", lambda limit=limit: limit)
+        assert abs(0.8 * memory.memory() - lanes) < 2
+    monkeypatch.setattr(memory, "memory_limit", lambda: 10**9)
+    assert memory.memory() == 0
+
+
 @pytest.mark.slow
 def test_chunks_give_the_same_results():
     from rtd3jax.training.lanes import advance_groups

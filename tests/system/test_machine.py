@@ -111,5 +111,5 @@ def test_slurm(alone, monkeypatch):
 def test_the_plan_asks_for_it(monkeypatch):
     from rtd3jax.study import memory
 
-    monkeypatch.setattr(memory, "memory_limit", lambda: 123)
-    assert memory.memory() == 123
+    monkeypatch.setattr(memory, "memory_limit", lambda: 123 * 2**30)
+    assert memory.memory() == 123 * 2**30

@@ -1,0 +1,96 @@
+"""JAX's own switches, as its users turn them on: each works, or one line says that it does not."""
+
+import os
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+import rtd3jax as rtd
+
+WORKING = [
+    *("JAX_DEBUG_NANS=1", "JAX_DEBUG_INFS=1", "JAX_ENABLE_X64=1", "JAX_CHECK_TRACER_LEAKS=1"),
+    *("JAX_NUMPY_RANK_PROMOTION=raise", "JAX_NUMPY_DTYPE_PROMOTION=strict"),
+    *("JAX_DEFAULT_MATMUL_PRECISION=highest", "JAX_DEFAULT_MATMUL_PRECISION=bfloat16"),
+    *("JAX_DEFAULT_PRNG_IMPL=rbg", "JAX_THREEFRY_PARTITIONABLE=0", "JAX_LOG_COMPILES=1"),
+    *("JAX_EXPLAIN_CACHE_MISSES=1", "JAX_PLATFORMS=cpu"),
+]
+
+EVERYTHING = """
+import sys
+import numpy as np
+import rtd3jax as rtd
+from rtd3jax import sweep
+from rtd3jax.study import references
+
+references.EPISODES = 2
+tiny = dict(total_steps=40, hidden_size=4, batch_size=4, learning_starts=10, eval_every=20)
+tiny |= dict(eval_episodes=1)
+env = rtd.make("rover", "ar1-slip")
+run = rtd.train(env, rtd.Config("h-td3", history_length=2, **tiny), [0], progress=False)
+assert not run.failures and np.isfinite(run.returns).all()
+rtd.evaluate(run.policy(0), env, episodes=2)
+action, _ = run.policy(0).step(run.policy(0).init(), np.zeros(2, np.float32))
+assert np.isfinite(action).all()
+rtd.check_env(env)
+world = rtd.to_gymnasium(env)
+world.reset(seed=0)
+world.step(world.action_space.sample())
+command = "--env rover --disturbances ar1-slip --algorithms td3 --seeds 1 --final-episodes 2"
+flags = [f"--{name.replace('_', '-')}={value}" for name, value in tiny.items()]
+sys.exit(sweep.main([*command.split(), *flags, "--quiet", "--no-report", "--out", sys.argv[1]]))
+"""
+
+
+def with_switch(switch, code, *arguments):
+    name, value = switch.split("=")
+    cache = jax.config.jax_compilation_cache_dir
+    return subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code, *map(str, arguments)],
+        env={**os.environ, "JAX_COMPILATION_CACHE_DIR": cache, name: value},
+        capture_output=True,
+        text=True,
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("switch", WORKING)
+def test_everything_works_under_it(switch, tmp_path):
+    done = with_switch(switch, EVERYTHING, tmp_path / "run")
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+def test_a_platform_that_is_not_there_is_named_with_the_remedy():
+    done = with_switch("JAX_PLATFORMS=tpu", "import rtd3jax")
+    last = done.stderr.splitlines()[-1]
+    assert "UserError: JAX finds no device with JAX_PLATFORMS=tpu" in last and "unset it" in last
+
+
+def test_a_transfer_guard_is_refused_but_does_not_hinder_the_import():
+    code = "import sys; from rtd3jax import sweep; sys.exit(sweep.main(['--env', 'rover']))"
+    done = with_switch("JAX_TRANSFER_GUARD=disallow", code)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+    assert done.stderr.startswith("error: JAX_TRANSFER_GUARD forbids what rtd3jax must do")
+
+
+@pytest.mark.parametrize(
+    "guard",
+    [jax.transfer_guard, jax.transfer_guard_host_to_device, jax.transfer_guard_device_to_host],
+)
+def test_every_direction_of_the_guard_is_seen(guard):
+    for level, refused in (("disallow", True), ("disallow_explicit", True), ("allow", False)):
+        with guard(level):
+            (finding,) = rtd.find_problems(object())
+        assert ("TRANSFER_GUARD" in finding.problem) == refused
+
+
+def test_without_jit_an_environment_can_be_looked_into_and_not_trained_on():
+    env = rtd.make("rover", "ar1-slip", max_steps_in_episode=2)
+    compiled = rtd.evaluate(rtd.random_policy(env), env, episodes=2)
+    with jax.disable_jit():
+        with pytest.raises(rtd.UserError, match="JAX_DISABLE_JIT does not go with training"):
+            rtd.train(env, rtd.Config("td3"), [0])
+        looked_into = rtd.evaluate(rtd.random_policy(env), env, episodes=2)
+    np.testing.assert_allclose(looked_into, compiled, rtol=1e-5)
