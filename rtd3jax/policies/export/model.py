@@ -9,8 +9,8 @@ Rows that would have begun before the episode begin at its first token instead, 
 what does not exist leaves no trace. So **a state of zeros is the start of an episode**, and neither
 a counter nor a mask is needed. No row is ever older than the window.
 
-A policy that acts with a running carry has one row, which begins at the episode's start and is
-never dropped: one token a step, whatever the history length. Zeros are the start there too.
+A policy that acts with a running carry has that one alone, without an axis of rows: one token a
+step, whatever the history length. Zeros are the start there too.
 
 Tokens hold actions in half ranges about the centre of the environment's range: the tanh of the
 output. Only the action that leaves is in the environment's units.
@@ -77,11 +77,6 @@ class Model:
         return self.acting == "carry"
 
     @property
-    def rows(self) -> int:
-        """Carries that stand side by side between two steps."""
-        return 1 if self.runs_on else self.history_length
-
-    @property
     def width(self) -> int:
         """H."""
         return self.network.head.outputs
@@ -96,7 +91,7 @@ class Model:
         """Shapes of the state's parts for one episode, in the order in which files list them."""
         shapes: dict[str, tuple[int, ...]] = {}
         for name, shape in carry_shapes(self.network).items():
-            shapes[name] = (self.rows, *shape)
+            shapes[name] = shape if self.runs_on else (self.history_length, *shape)
         if "previous_action" in (*self.memory, *self.current):
             shapes["previous_action"] = (self.action_size,)
         return shapes
@@ -109,7 +104,6 @@ class Model:
             "memory_has_current": self.memory_has_current,
             "current": list(self.current),
             "cell": self.cell,
-            "rows": self.rows,
             "state": {name: list(shape) for name, shape in self.state_shapes.items()},
             "initial_state": "zeros",
         }

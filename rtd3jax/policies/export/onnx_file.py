@@ -106,7 +106,7 @@ def _build(graph: _Graph, model: Model) -> None:
         if model.memory_has_current:
             carry = _feed(graph, model, carry)
         if model.runs_on:
-            features.append(graph.add("Squeeze", [carry[0], graph.integers(1)]))
+            features.append(carry[0])
         else:
             features.append(_row(graph, carry[0], length))
             carry = [_rows(graph, part, length) for part in carry]
@@ -136,46 +136,54 @@ _CARRIES: dict[str | None, tuple[str, ...]] = {
 
 
 def _feed(graph: _Graph, model: Model, carry: list[str], action: str = "") -> list[str]:
-    """The carries [B, rows, H] after the step's token; ``action`` where a token has it."""
+    """The carries [B, rows, H], or [B, H] of one that runs on, after the step's token.
+
+    ``action`` is for where a token has it.
+    """
     parts = [action if part == "action" else part for part in model.memory]
     token = graph.add("Relu", [graph.linear("encoder", graph.join(parts))])
-    token = graph.add("Unsqueeze", [graph.linear("input", token), graph.integers(1)])
+    token = graph.linear("input", token)
+    if not model.runs_on:
+        token = graph.add("Unsqueeze", [token, graph.integers(1)])
     cells: dict[str | None, Callable[..., list[str]]] = {
         "lstm": _lstm,
         "gru": _gru,
         "min-gru": _min_gru,
     }
-    return cells[model.cell](graph, model.width, token, *carry)
+    return cells[model.cell](graph, model.width, token, *carry, axis=1 if model.runs_on else 2)
 
 
-def _lstm(graph: _Graph, width: int, token: str, hidden: str, cell: str) -> list[str]:
-    recurrent = graph.add("MatMul", [hidden, graph.weight("recurrent_kernel")])
-    gates = graph.add("Add", [recurrent, token])
-    graph.add("Split", [gates, graph.integers(3 * width, width)], "ifo", "g", axis=2)
+def _lstm(graph: _Graph, width: int, token: str, hidden: str, cell: str, *, axis: int) -> list[str]:
+    kernel = graph.weight("recurrent_kernel")
+    if axis == 1:
+        gates = graph.add("Gemm", [hidden, kernel, token])
+    else:
+        gates = graph.add("Add", [graph.add("MatMul", [hidden, kernel]), token])
+    graph.add("Split", [gates, graph.integers(3 * width, width)], "ifo", "g", axis=axis)
     sigmoids = graph.add("Sigmoid", ["ifo"])
-    graph.add("Split", [sigmoids, graph.integers(width, width, width)], "i", "f", "o", axis=2)
+    graph.add("Split", [sigmoids, graph.integers(width, width, width)], "i", "f", "o", axis=axis)
     kept = graph.add("Mul", ["f", cell])
     added = graph.add("Mul", ["i", graph.add("Tanh", ["g"])])
     cell = graph.add("Add", [kept, added])
     return [graph.add("Mul", ["o", graph.add("Tanh", [cell])]), cell]
 
 
-def _gru(graph: _Graph, width: int, token: str, hidden: str) -> list[str]:
+def _gru(graph: _Graph, width: int, token: str, hidden: str, *, axis: int) -> list[str]:
     recurrent = graph.add("MatMul", [hidden, graph.weight("recurrent_kernel")])
     recurrent = graph.add("Add", [recurrent, graph.weight("recurrent_bias")])
     sizes = graph.integers(2 * width, width)
-    graph.add("Split", [token, sizes], "token_gates", "token_candidate", axis=2)
-    graph.add("Split", [recurrent, sizes], "carry_gates", "carry_candidate", axis=2)
+    graph.add("Split", [token, sizes], "token_gates", "token_candidate", axis=axis)
+    graph.add("Split", [recurrent, sizes], "carry_gates", "carry_candidate", axis=axis)
     gates = graph.add("Sigmoid", [graph.add("Add", ["token_gates", "carry_gates"])])
-    graph.add("Split", [gates, graph.integers(width, width)], "reset", "update", axis=2)
+    graph.add("Split", [gates, graph.integers(width, width)], "reset", "update", axis=axis)
     kept = graph.add("Mul", ["reset", "carry_candidate"])
     candidate = graph.add("Tanh", [graph.add("Add", ["token_candidate", kept])])
     change = graph.add("Mul", ["update", graph.add("Sub", [hidden, candidate])])
     return [graph.add("Add", [candidate, change])]
 
 
-def _min_gru(graph: _Graph, width: int, token: str, hidden: str) -> list[str]:
-    graph.add("Split", [token, graph.integers(width, width)], "gate", "candidate", axis=2)
+def _min_gru(graph: _Graph, width: int, token: str, hidden: str, *, axis: int) -> list[str]:
+    graph.add("Split", [token, graph.integers(width, width)], "gate", "candidate", axis=axis)
     gate = graph.add("Sigmoid", ["gate"])
     change = graph.add("Sub", [graph.add("Tanh", ["candidate"]), hidden])
     return [graph.add("Add", [hidden, graph.add("Mul", [gate, change])])]

@@ -39,8 +39,8 @@ class Player:
         }
         self._centre, self._half_range = arrays["action_centre"], arrays["action_half_range"]
         self._centre_token = arrays.get("centre_token")
-        self._length: int = about["rows"]
         self._runs_on: bool = about["acting"] == "carry"
+        self._length: int = 1 if self._runs_on else about["history_length"]
         self._with_current: bool = about["memory_has_current"]
         if about["memory"]:
             width = arrays["head_bias"].size

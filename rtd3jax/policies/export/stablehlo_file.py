@@ -91,12 +91,13 @@ def play(
     feature = None
     if model.memory:
         structure = jax.tree.structure(jax.eval_shape(lambda: network.zero_carry(1)))
-        carry = [state[n] if model.runs_on else _with_zero_row(state[n]) for n in names]
+        carry = [state[n][:, None] if model.runs_on else _with_zero_row(state[n]) for n in names]
         if model.memory_has_current:
             carry = feed(carry)
         last = jax.tree.unflatten(structure, [part[:, -1] for part in carry])
         feature = network.apply(variables, last, method=lambda m, c: m.memory.read(c))
-        carry = [part[:, : model.rows] for part in carry]
+        if not model.runs_on:
+            carry = [part[:, :-1] for part in carry]
     current = None
     if model.current:
         current = jnp.concatenate([parts[part] for part in model.current], axis=-1)
@@ -109,6 +110,8 @@ def play(
     parts["action"] = token
     if model.memory and not model.memory_has_current:
         carry = feed(carry)
+    if model.runs_on:
+        carry = [part[:, 0] for part in carry]
     following = {"previous_action": token, **dict(zip(names, carry, strict=True))}
     action = action.reshape(-1, *model.action_shape)
     return action, {name: following[name] for name in model.state_shapes}
