@@ -30,7 +30,8 @@ DISTURBANCES = (
     "noise:reward_from=state",
     "noise:sigma=1.0",
 )
-EPISODES, SEED = 1_000, 0
+EPISODES, SEED = 1_000, 1
+# Not 0, on whose episodes the filter's process noise was chosen.
 
 
 def row(name: str, episodes: int, ceiling: float) -> dict[str, object]:

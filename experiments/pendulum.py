@@ -34,7 +34,7 @@ from rtd3jax.study.transfer import transfer
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from pendulum_cells import cells, current_setting, missing, settings_of  # noqa: E402
-from pendulum_figures import draw_all  # noqa: E402
+from pendulum_figures import draw_all, filter_returns  # noqa: E402
 from settings import mark, notes, setting_text  # noqa: E402
 from writing import (  # noqa: E402
     RESULTS,
@@ -139,10 +139,13 @@ def of_each(lanes: pd.DataFrame, column: str) -> dict[str, str]:
     return found
 
 
-def table(lanes: pd.DataFrame, column: str, names: tuple[str, ...]) -> str:
+def table(
+    lanes: pd.DataFrame, column: str, names: tuple[str, ...], filtered: dict[str, float]
+) -> str:
     """Agents and lengths down, disturbances across: mean normalised return ± std over seeds.
 
-    Cells that were trained with an earlier setting are marked.
+    Cells that were trained with an earlier setting are marked. ``filtered`` has the filter's
+    returns, in a row of their own.
     """
     older = lanes["setting"] != lanes["algorithm"].map(current_setting)
     body = []
@@ -157,6 +160,9 @@ def table(lanes: pd.DataFrame, column: str, names: tuple[str, ...]) -> str:
                 dagger = mark(int(older[here.index].sum()), len(here))
                 line.append(f"{values.mean():.3f}{spread}{dagger}" if len(values) else "not run")
             body.append(line)
+    if filtered:
+        known = [f"{filtered[name]:.3f}" if name in filtered else "–" for name in names]
+        body.append(["a Bayes filter that knows the process", "–", *known])
     header = ["agent", "l", *names]
     return "\n".join([markdown_table(header, body), *notes(lanes["setting"][older])])
 
@@ -202,7 +208,8 @@ def report(options: argparse.Namespace, episodes: int, began: float) -> int:
     lanes = lanes.rename(columns={"tested_on": "disturbance", "true_return": "mean"})
     lanes = with_others(lanes, options.out / "pendulum.parquet", "disturbance")
     lanes["episodes"] = lanes["episodes"].fillna(EARLIER_EPISODES).astype(int)
-    text = table(lanes, "disturbance", ALL_DISTURBANCES)
+    filtered = filter_returns(options.out)
+    text = table(lanes, "disturbance", ALL_DISTURBANCES, filtered)
     write_results(options.out, "pendulum", lanes, text, facts(lanes, began))
     curves = pd.concat([curves_of(run) for run in found], ignore_index=True)
     curves_file = options.out / "pendulum_curves.parquet"
@@ -213,7 +220,7 @@ def report(options: argparse.Namespace, episodes: int, began: float) -> int:
         print("missing: generalisation: nothing is trained on random-sine")
     else:
         moved = with_others(carried, options.out / "generalisation.parquet", "tested_on")
-        text = table(moved, "tested_on", CONDITIONS)
+        text = table(moved, "tested_on", CONDITIONS, filtered)
         under = lanes[lanes["disturbance"] == "random-sine"]
         about = {**facts(under, began), "episodes": episodes}
         write_results(options.out, "generalisation", moved, text, about)

@@ -6,7 +6,8 @@ Reads pendulum.parquet, pendulum_curves.parquet and generalisation.parquet, and 
 SVG, what they have rows for:
 
 * pendulum_learning_curves: rows are disturbances, columns agents, a curve per length;
-* pendulum: final return against the agent, a line per length, dots are seeds;
+* pendulum: final return against the agent, a line per length, dots are seeds; dashes are a Bayes
+  filter that knows the process;
 * action_history: `lstm-td3` with and without past actions, a panel per length;
 * generalisation: bars of the agents trained on `random-sine`, a panel per condition.
 
@@ -66,6 +67,18 @@ def name_of(length: int) -> str:
     return f"l = {length}" if length else "no window"
 
 
+def filter_returns(results: pathlib.Path) -> dict[str, float]:
+    """Normalised returns of a Bayes filter that knows the process, by disturbance.
+
+    Of experiments/filter_reference.py: no agent needs to know more than it does, so that they bound
+    the best agent's from below.
+    """
+    path = results / "filter_reference.parquet"
+    if not path.exists():
+        return {}
+    return dict(pd.read_parquet(path).set_index("disturbance")["normalised"])
+
+
 def learning_curves(curves: pd.DataFrame) -> Figure:
     """Mean over seeds of the normalised return, a band of one standard deviation."""
     names = [name for name in DISTURBANCES if (curves["disturbance"] == name).any()]
@@ -104,8 +117,11 @@ def learning_curves(curves: pd.DataFrame) -> Figure:
     return figure
 
 
-def final_returns(lanes: pd.DataFrame) -> Figure:
-    """A panel per disturbance, agents across, a line per length; dots are seeds."""
+def final_returns(lanes: pd.DataFrame, filtered: dict[str, float]) -> Figure:
+    """A panel per disturbance, agents across, a line per length; dots are seeds.
+
+    The line of dashes is the return of the filter.
+    """
     names = [name for name in DISTURBANCES if (lanes["disturbance"] == name).any()]
     columns = min(len(names), 4)
     rows = -(-len(names) // columns)
@@ -128,6 +144,8 @@ def final_returns(lanes: pd.DataFrame) -> Figure:
                 seeds = own[own["algorithm"] == agent]["normalised"]
                 axes.plot([index] * len(seeds), seeds, ".", ms=3, color=colour, alpha=0.4)
         axes.axhline(1.0, color=GREY, lw=0.8)
+        if name in filtered:
+            axes.axhline(filtered[name], color=GREY, lw=1.0, ls="--")
         axes.set_xticks(range(len(agents)), agents, rotation=60, ha="right")
         axes.set_title(name, fontsize=10)
         axes.grid(axis="y", color="#E4E4E4", lw=0.6)
@@ -206,7 +224,7 @@ def draw_all(results: pathlib.Path, out: pathlib.Path) -> None:
 
     lanes, curves, moved = rows("pendulum"), rows("pendulum_curves"), rows("generalisation")
     drawn = {
-        "pendulum": final_returns(lanes) if len(lanes) else None,
+        "pendulum": final_returns(lanes, filter_returns(results)) if len(lanes) else None,
         "pendulum_learning_curves": learning_curves(curves) if len(curves) else None,
         "action_history": action_history(lanes) if len(lanes) else None,
         "generalisation": generalisation(moved) if len(moved) else None,
