@@ -125,10 +125,10 @@ class Config:
         low=0,
     )
     burn_in_gradient: bool = dataclasses.field(
-        default=True,
+        default=False,
         metadata={
             "help": "whether a segment's gradient flows back into its burn-in, the history_length "
-            "steps before it"
+            "steps before it; it costs time and brought nothing (experiments/segments_returns.py)"
         },
     )
     acting: str | None = dataclasses.field(

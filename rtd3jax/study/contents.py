@@ -57,6 +57,11 @@ class Contents:
             cells = tuple(Cell.from_dict(dict(cell)) for cell in study["cells"])
             seeds, episodes = check_seeds(study["seeds"]), int(study["final_episodes"])
             stages = tuple(int(count) for count in study.get("stages", ()))
+        except UserError as error:
+            raise UserError(
+                f"{config}: {error}; register what is your own before you open the study, or name "
+                "its module with --import"
+            ) from error
         except (KeyError, TypeError, ValueError) as error:
             raise UserError(f"{config} is not a study's configuration") from error
         return cls(cells, seeds, episodes, stages)

@@ -1,0 +1,32 @@
+"""A configuration that cannot be read says why."""
+
+import json
+
+import pytest
+
+import rtd3jax as rtd
+from rtd3jax.study.contents import Contents
+from rtd3jax.study.plan import Cell
+
+
+def _config(path, **changes):
+    cell = Cell("rover", "ar1-slip", rtd.Config("td3")).to_dict()
+    study = {"cells": [{**cell, **changes}], "seeds": [0], "final_episodes": 1}
+    path.write_text(json.dumps({"format": 2, "study": study}))
+    return path
+
+
+def test_an_agent_that_is_not_registered_here_is_named_with_the_remedy(tmp_path):
+    path = _config(tmp_path / "config.json", algorithm="my-own-td3")
+    with pytest.raises(rtd.UserError, match="my-own-td3.*register what is your own.*--import"):
+        Contents.read(path)
+    path = _config(tmp_path / "config.json", memory="my-own-cell")
+    with pytest.raises(rtd.UserError, match="my-own-cell.*register what is your own"):
+        Contents.read(path)
+
+
+def test_what_is_no_study_says_so(tmp_path):
+    path = _config(tmp_path / "config.json", history_length=[])
+    path.write_text(json.dumps({"format": 2, "study": {"cells": 3}}))
+    with pytest.raises(rtd.UserError, match="is not a study's configuration"):
+        Contents.read(path)
