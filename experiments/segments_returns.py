@@ -51,25 +51,27 @@ ROVER = {**presets.ROVER_SETTINGS, "total_steps": 40_000, "batch_size": 100}
 PENDULUM = {**presets.PENDULUM_SETTINGS, "total_steps": presets.PENDULUM_STEPS}
 SEGMENTS: dict[str, Any] = {"replay": "segments"}
 CHOSEN: dict[tuple[str, int], dict[str, Any]] = {
-    ("rover", 6): {**SEGMENTS, "batch_size": 200, "segment_length": 4},
-    ("pendulum", 6): {**SEGMENTS, "batch_size": 50, "segment_length": 5},
-    ("pendulum", 20): {**SEGMENTS, "batch_size": 100, "segment_length": 10},
+    ("rover", 6): {**SEGMENTS, "batch_size": 200, "segment_length": 10, "burn_in_gradient": False},
+    **dict.fromkeys(
+        (("pendulum", 6), ("pendulum", 20)),
+        {**SEGMENTS, "batch_size": 100, "segment_length": 10, "burn_in_gradient": False},
+    ),
 }
 """Of the candidates, by environment and history length."""
 CANDIDATES: dict[tuple[str, int], list[tuple[int, int, bool, str]]] = {
     ("pendulum", 6): [
         (50, 5, True, "carry"),
         (50, 5, True, "window"),
-        (100, 10, True, "window"),
         (80, 5, True, "window"),
+        (100, 10, True, "window"),
+        (100, 10, False, "carry"),
     ],
     ("pendulum", 20): [
         (100, 10, True, "carry"),
-        (100, 10, True, "window"),
         (100, 10, False, "carry"),
         (200, 20, True, "carry"),
     ],
-    ("rover", 6): [(100, 5, True, "carry"), (200, 10, True, "carry"), (200, 10, True, "window")],
+    ("rover", 6): [(200, 10, False, "carry")],
 }
 """Batch size, segment length, whether the burn-in has a gradient, and how the agent acts."""
 SEARCHED = ("pendulum hidden l=6", "pendulum hidden l=20", "rover ar1-slip l=6")

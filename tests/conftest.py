@@ -1,10 +1,17 @@
 """Strictness for every test, and a cache of compiled programs."""
 
+import os
 import pathlib
 
 import hypothesis
 import jax
 import matplotlib
+
+# Read when JAX's backend starts, here and in the processes that tests start: nearly all of the
+# suite's time is compiling, and code that is not optimised takes half as long to compile.
+_LEVEL = "--xla_backend_optimization_level"
+if _LEVEL not in os.environ.get("XLA_FLAGS", ""):
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_LEVEL}=0".strip()
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -11,7 +11,11 @@ import rtd3jax as rtd
 
 
 class Params(struct.PyTreeNode):
+    """The range of the actions is a parameter, so that one program serves every unit."""
+
     max_steps_in_episode: int = 20
+    centre: jax.Array | tuple = (0.0, 0.0)
+    half_range: jax.Array | tuple = (1.0, 1.0)
 
 
 class State(struct.PyTreeNode):
@@ -22,10 +26,6 @@ class State(struct.PyTreeNode):
 class Follow(environment.Environment):
     """Reward: minus the squared distance of each action, in half ranges, from what is seen."""
 
-    def __init__(self, centre, half_range):
-        super().__init__()
-        self.centre, self.half_range = (np.asarray(x, np.float32) for x in (centre, half_range))
-
     @property
     def default_params(self):
         return Params()
@@ -35,17 +35,20 @@ class Follow(environment.Environment):
         return x, State(jnp.int32(0), x)
 
     def step_env(self, key, state, action, params):
-        action = (action - self.centre) / self.half_range
+        action = (action - params.centre) / params.half_range
         reward = -jnp.sum(jnp.square(action - state.x[:2]))
         new = State(state.time + 1, 0.9 * state.x)
         return new.x, new, reward, jnp.asarray(False), {}
 
     def action_space(self, params=None):
-        return spaces.Box(self.centre - self.half_range, self.centre + self.half_range, (2,))
+        centre, half_range = jnp.asarray(params.centre), jnp.asarray(params.half_range)
+        return spaces.Box(centre - half_range, centre + half_range, (2,))
+
+
+ENV = Follow()
 
 
 def _trained(centre, half_range, algorithm):
-    env = Follow(centre, half_range)
     config = rtd.Config(
         algorithm=algorithm,
         history_length=None if algorithm == "td3" else 2,
@@ -56,7 +59,8 @@ def _trained(centre, half_range, algorithm):
         eval_every=200,
         eval_episodes=5,
     )
-    return env, rtd.train(env, config, seeds=[0], progress=False)
+    params = Params(centre=jnp.float32(centre), half_range=jnp.float32(half_range))
+    return params, rtd.train(ENV, config, seeds=[0], params=params, progress=False)
 
 
 @pytest.mark.parametrize("algorithm", ["td3", "lstm-td3", "h-td3"])
@@ -72,8 +76,8 @@ def test_the_unit_of_the_actions_does_not_matter(algorithm):
 
 
 def test_neither_does_the_centre():
-    _, run = _trained([0, 0], [1, 1], "lstm-td3-1ha1hc")
-    env, other = _trained([100, 0.3], [1, 0.3], "lstm-td3-1ha1hc")
+    _, run = _trained([0, 0], [1, 1], "lstm-td3")
+    env, other = _trained([100, 0.3], [1, 0.3], "lstm-td3")
     assert run.returns[0, -1] > 0.5 * run.returns[0, 0]  # it learns
     np.testing.assert_allclose(other.returns, run.returns, rtol=1e-2)
     policy, expected = other.policy(0), run.policy(0)

@@ -1,6 +1,7 @@
 """That the agents learn: fixed budgets, wide margins."""
 
 import rtd3jax as rtd
+from rtd3jax.study.presets import PRESETS
 
 
 def test_td3_swings_up_the_fully_observable_pendulum():
@@ -13,11 +14,13 @@ def test_a_recurrent_agent_compensates_wheel_slip():
     env = rtd.make("rover", disturbance="ar1-slip")
     config = rtd.Config(
         algorithm="lstm-td3-1ha1hc",
-        history_length=2,
-        total_steps=10_000,
-        hidden_size=64,
-        eval_every=5_000,
-        eval_episodes=20,
+        **{
+            **PRESETS["quick"][0].settings,
+            "history_length": 1,
+            "total_steps": 8_000,
+            "eval_every": 8_000,
+            "eval_episodes": 20,
+        },
     )
     run = rtd.train(env, config, [0, 1], progress=False)
-    assert run.returns[:, -1].mean() > -2.6
+    assert run.returns[:, -1].mean() > -2.2
