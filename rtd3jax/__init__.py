@@ -22,7 +22,9 @@ from rtd3jax.envs.registry import make, register
 from rtd3jax.envs.rover.optimum import bayes_policy
 from rtd3jax.errors import UserError
 from rtd3jax.evaluation.ceiling import ceiling
+from rtd3jax.evaluation.episode import Trajectory, rollout
 from rtd3jax.evaluation.gymnasium import run_in_gymnasium
+from rtd3jax.evaluation.plot import plot_episode
 from rtd3jax.evaluation.rollout import evaluate
 from rtd3jax.policies.baselines import constant_policy, random_policy
 from rtd3jax.policies.export.stablehlo_file import load_stablehlo
@@ -62,6 +64,7 @@ __all__ = [
     "Sine",
     "Study",
     "Sum",
+    "Trajectory",
     "UserError",
     "ValueIdentity",
     "Variant",
@@ -79,11 +82,13 @@ __all__ = [
     "from_brax",
     "make",
     "make_agent",
+    "plot_episode",
     "random_policy",
     "register",
     "register_agent",
     "register_learner",
     "register_memory",
+    "rollout",
     "run_in_gymnasium",
     "to_gymnasium",
     "train",
