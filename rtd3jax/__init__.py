@@ -12,6 +12,7 @@ from rtd3jax.envs.builtin import DISTURBANCES, ENVIRONMENTS
 from rtd3jax.envs.check import Finding, check_env, find_problems
 from rtd3jax.envs.compat.brax import from_brax
 from rtd3jax.envs.compat.gymnasium import register_with_gymnasium, to_gymnasium
+from rtd3jax.envs.controllers import function_policy, lqr_policy, pid_policy
 from rtd3jax.envs.disturbed import disturb
 from rtd3jax.envs.identity import ValueIdentity
 from rtd3jax.envs.pendulum.filter import filter_policy
@@ -76,12 +77,15 @@ __all__ = [
     "disturb",
     "evaluate",
     "filter_policy",
+    "function_policy",
     "load_policy",
     "load_stablehlo",
+    "lqr_policy",
     "find_problems",
     "from_brax",
     "make",
     "make_agent",
+    "pid_policy",
     "plot_episode",
     "random_policy",
     "register",
