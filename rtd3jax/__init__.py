@@ -12,6 +12,7 @@ from rtd3jax.envs.builtin import DISTURBANCES, ENVIRONMENTS
 from rtd3jax.envs.check import Finding, check_env, find_problems
 from rtd3jax.envs.compat.brax import from_brax
 from rtd3jax.envs.compat.gymnasium import register_with_gymnasium, to_gymnasium
+from rtd3jax.envs.controllers import function_policy, lqr_policy, pid_policy
 from rtd3jax.envs.disturbed import disturb
 from rtd3jax.envs.identity import ValueIdentity
 from rtd3jax.envs.pendulum.filter import filter_policy
@@ -22,7 +23,9 @@ from rtd3jax.envs.registry import make, register
 from rtd3jax.envs.rover.optimum import bayes_policy
 from rtd3jax.errors import UserError
 from rtd3jax.evaluation.ceiling import ceiling
+from rtd3jax.evaluation.episode import Trajectory, rollout
 from rtd3jax.evaluation.gymnasium import run_in_gymnasium
+from rtd3jax.evaluation.plot import plot_episode
 from rtd3jax.evaluation.rollout import evaluate
 from rtd3jax.policies.baselines import constant_policy, random_policy
 from rtd3jax.policies.export.stablehlo_file import load_stablehlo
@@ -62,6 +65,7 @@ __all__ = [
     "Sine",
     "Study",
     "Sum",
+    "Trajectory",
     "UserError",
     "ValueIdentity",
     "Variant",
@@ -73,17 +77,22 @@ __all__ = [
     "disturb",
     "evaluate",
     "filter_policy",
+    "function_policy",
     "load_policy",
     "load_stablehlo",
+    "lqr_policy",
     "find_problems",
     "from_brax",
     "make",
     "make_agent",
+    "pid_policy",
+    "plot_episode",
     "random_policy",
     "register",
     "register_agent",
     "register_learner",
     "register_memory",
+    "rollout",
     "run_in_gymnasium",
     "to_gymnasium",
     "train",

@@ -24,6 +24,7 @@ LAYERS = {
     "sweep": 8,
     "report": 8,
     "transfer": 8,
+    "compare": 8,
     "export": 9,
 }
 """The height of each folder and module. `policies.load` opens run directories: it is above `study`,
@@ -144,7 +145,7 @@ def test_few_parameters_are_typed_any():
 
 
 def test_few_modules_lie_at_the_root():
-    commands = {"sweep", "report", "transfer", "export"}
+    commands = {"sweep", "report", "transfer", "compare", "export"}
     modules = {path.stem for path in ROOT.glob("*.py")} - commands - {"__init__"}
     assert len(modules) <= 6, modules
 

@@ -43,7 +43,8 @@ def test_a_run_directory_holds_what_it_should(tmp_path, capsys, monkeypatch):
     curves = read_table(out / "curves.parquet", CURVES)
     assert len(curves) == 2 * 2 * 2 and set(curves["step"]) == {30, 60}
     episodes = read_table(out / "episodes.parquet", EPISODES)
-    assert set(episodes["algorithm"]) == {"td3", "lstm-td3-1ha1hc", "random", "constant"}
+    trained, baselines = {"td3", "lstm-td3-1ha1hc"}, {"random", "constant", "feedforward-pi"}
+    assert set(episodes["algorithm"]) == trained | baselines
     assert np.isfinite(episodes["return"]).all()
     study = json.loads((out / "config.json").read_text())
     assert study["made_with"]["versions"]["jax"] == jax.__version__
@@ -295,6 +296,7 @@ def test_a_module_that_registers_worlds_can_be_imported(tmp_path, monkeypatch, c
     assert "--import no_such_worlds: No module named" in capsys.readouterr().err
 
 
-def test_a_rover_with_faults_has_the_constant_command_too():
+def test_a_rover_with_faults_has_its_baselines_too():
     cell = Cell("rover", "ar1-slip+gain-drift", Config(algorithm="td3"))
-    assert [row.name for row in references.references_on(cell)] == ["random", "constant"]
+    names = [row.name for row in references.references_on(cell)]
+    assert names == ["random", "constant", "feedforward-pi"]

@@ -57,7 +57,8 @@ class About:
 
     Attributes:
         baselines: by name, functions of the environment as it was made, disturbances included. Each
-            returns a policy, or the action of a policy that is constant.
+            returns a policy, or the action of a policy that is constant; None where it has nothing
+            to say, such as a controller that does not see what it controls.
         ceiling: takes the environment as it was made, how many episodes a random mean takes, and a
             seed. It returns a `Ceiling`, or the best policy, whose return is then measured. It
             raises UserError where neither is known.

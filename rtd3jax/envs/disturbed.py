@@ -11,6 +11,7 @@ from jax.typing import ArrayLike
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.identity import ValueIdentity, strong
 from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT, describe, foreign_code
+from rtd3jax.envs.processes.disturbances import Hidden
 from rtd3jax.envs.processes.process import Chain, NoDisturbance, Process
 from rtd3jax.errors import UserError, nearest
 from rtd3jax.protocols import ComposableEnvironment, EnvironmentLike
@@ -121,15 +122,21 @@ class Disturbed(ValueIdentity, environment.Environment):
             )
         return size
 
+    def undisturbed_reset(self, key: jax.Array, params: DisturbedParams) -> tuple[jax.Array, Any]:
+        """What `reset_env` of the same key hides: the true first observation [S], and its state."""
+        key_env, _, _ = jax.random.split(key, 3)
+        with foreign_code():
+            observation, state = self.base.reset_env(key_env, params.env)
+        return jnp.asarray(observation, jnp.float32), state
+
     def reset_env(
         self, key: jax.Array, params: DisturbedParams
     ) -> tuple[jax.Array, DisturbedState]:
         """Start an episode of all; returns the first observation [O]."""
-        key_env, key_init, key_process = jax.random.split(key, 3)
+        _, key_init, key_process = jax.random.split(key, 3)
+        true_observation, env = self.undisturbed_reset(key, params)
         with foreign_code():
-            true_observation, env = self.base.reset_env(key_env, params.env)
             actions = _action_size(self.base, params.env)
-        true_observation = jnp.asarray(true_observation, jnp.float32)
         (full,) = true_observation.shape
         self._size(params, full)
         horizon = getattr(params, "max_steps_in_episode", DEFAULT_STEP_LIMIT)
@@ -274,6 +281,21 @@ def sequence(*processes: Process) -> Process:
         if not isinstance(process, NoDisturbance):
             flat += process.processes if isinstance(process, Chain) else [process]
     return Chain(tuple(flat)) if len(flat) > 1 else flat[0] if flat else NoDisturbance()
+
+
+def seen_elements(env: EnvironmentLike, params: Any, size: int) -> list[int]:
+    """Which of the ``size`` elements of the undisturbed observation are seen, in their order.
+
+    ``params`` are those of ``env``. Only `Hidden` is known to remove any: where the policy sees
+    another number of elements than are returned, nobody knows which they are.
+    """
+    elements = list(range(size))
+    if isinstance(env, Disturbed):
+        process = params.observation
+        for part in process.processes if isinstance(process, Chain) else (process,):
+            if isinstance(part, Hidden):
+                del elements[part.element]
+    return elements
 
 
 def check_fit(env: Disturbed) -> None:

@@ -35,7 +35,8 @@ def references_on(cell: Cell) -> list[Reference]:
             raise UserError(f"the baseline {name!r} of {cell.env} has the name of an agent")
         try:
             made = make_policy(env)
-            policies[name] = made if hasattr(made, "step") else constant_policy(made)
+            if made is not None:
+                policies[name] = made if hasattr(made, "step") else constant_policy(made)
         except UserError:
             raise
         except Exception as error:  # a user's function may do anything

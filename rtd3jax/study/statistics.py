@@ -9,6 +9,7 @@ bootstrap over seeds.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -100,6 +101,65 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> float:
     wins = first[:, None] > second[None, :]
     ties = first[:, None] == second[None, :]
     return float(np.mean(wins + 0.5 * ties))
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """How much better ``y`` is than ``x``, with 95 % bootstrap intervals over seeds."""
+
+    pairs: int  # seeds that both have, by which the difference is paired; 0 when it is not
+    difference: float  # mean of y minus x; nan when either side has no finite value
+    difference_low: float  # nan when either side has fewer than two
+    difference_high: float
+    improvement: float  # probability that a random seed of y beats one of x
+    improvement_low: float
+    improvement_high: float
+
+
+def compare(x: Mapping[int, float], y: Mapping[int, float]) -> Comparison:
+    """Compare the value of each seed of ``y`` with those of ``x``, the baseline.
+
+    Equal seeds meet equal starts, so the difference is that of the seeds with a finite value on
+    both sides, pair by pair, where there are two of them at least; else that of the two means.
+    The probability of improvement is over all seeds. Failed seeds (non-finite values) are left out.
+    """
+    first, second = (
+        {seed: value for seed, value in sorted(values.items()) if math.isfinite(value)}
+        for values in (x, y)
+    )
+    nan = math.nan
+    if not first or not second:
+        return Comparison(0, nan, nan, nan, nan, nan, nan)
+    of_x, of_y = np.array(list(first.values())), np.array(list(second.values()))
+    common = [seed for seed in first if seed in second]
+    if len(common) >= 2:
+        pairs = np.sort(np.array([second[seed] - first[seed] for seed in common]))
+        difference = float(pairs.mean())
+    else:
+        common = []
+        difference = float(of_y.mean() - of_x.mean())
+    improvement = probability_of_improvement(of_y, of_x)
+    if min(of_x.size, of_y.size) < 2:
+        return Comparison(len(common), difference, nan, nan, improvement, nan, nan)
+    # How often each seed is drawn, [RESAMPLES, n] of either side.
+    random = np.random.default_rng(BOOTSTRAP_SEED)
+    if common:
+        drawn = [random.multinomial(pairs.size, np.full(pairs.size, 1 / pairs.size), RESAMPLES)]
+        differences = drawn[0] @ pairs / pairs.size
+    drawn = [random.multinomial(n, np.full(n, 1 / n), RESAMPLES) for n in (of_x.size, of_y.size)]
+    of_x, of_y = np.sort(of_x), np.sort(of_y)
+    if not common:
+        differences = drawn[1] @ of_y / of_y.size - drawn[0] @ of_x / of_x.size
+    wins = (of_y[:, None] > of_x[None, :]) + 0.5 * (of_y[:, None] == of_x[None, :])
+    chances = np.sum((drawn[1] @ wins) * drawn[0], axis=1) / wins.size
+    ends = (*_percentiles(differences), improvement, *_percentiles(chances))
+    return Comparison(len(common), difference, *ends)
+
+
+def _percentiles(values: np.ndarray) -> tuple[float, float]:
+    """The bounds of the central 95 %."""
+    low, high = np.quantile(values, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return float(low), float(high)
 
 
 def _finite(values: ArrayLike) -> tuple[np.ndarray, int]:

@@ -84,7 +84,10 @@ def _task_section(
     header = ["algorithm", "l", "seeds", "mean ± std", "IQM [low, high]"]
     header += ["true-state return"] if differs else []
     lines = [f"### {_cell_text(task[0])}, {_cell_text(task[1])}", ""]
-    lines += [_row(header), _row(["---", "---:", "---:", "---:", "---:", "---:"][: len(header)])]
+    lines += [
+        markdown_row(header),
+        markdown_row(["---", "---:", "---:", "---:", "---:", "---:"][: len(header)]),
+    ]
 
     rows = []
     for cell in started:
@@ -102,7 +105,7 @@ def _task_section(
         entries += [_spread(true) if true.n else MISSING] if differs else []
         order = (summary.n == 0, -summary.iqm if summary.n else 0.0, algorithm, length)
         rows.append((order, entries))
-    lines += [_row(entries) for _, entries in sorted(rows, key=lambda row: row[0])]
+    lines += [markdown_row(entries) for _, entries in sorted(rows, key=lambda row: row[0])]
 
     references = _select(episodes, task)
     references = references[~is_trained(references)]
@@ -110,12 +113,12 @@ def _task_section(
         played = references[references["algorithm"] == name]
         entries = [f"{name} (reference)", "–", "–", _spread(summarise(played["return"])), "–"]
         entries += [_spread(summarise(played["true_return"]))] if differs else []
-        lines.append(_row(entries))
+        lines.append(markdown_row(entries))
     if best.get("mean") is not None:
         name = "ceiling" if best["kind"] == "exact" else "ceiling (an upper bound)"
-        error = f" ± {_number(best['error'])}" if best["error"] else ""
-        entries = [name, "–", "–", f"{_number(best['mean'])}{error}", "–"]
-        lines.append(_row(entries + ["–"] * differs))
+        error = f" ± {number(best['error'])}" if best["error"] else ""
+        entries = [name, "–", "–", f"{number(best['mean'])}{error}", "–"]
+        lines.append(markdown_row(entries + ["–"] * differs))
     return [*lines, ""]
 
 
@@ -142,24 +145,25 @@ def _spread(summary: Summary) -> str:
     if summary.n == 0:
         return MISSING
     if math.isnan(summary.std):
-        return _number(summary.mean)
-    return f"{_number(summary.mean)} ± {_number(summary.std)}"
+        return number(summary.mean)
+    return f"{number(summary.mean)} ± {number(summary.std)}"
 
 
 def _interval(summary: Summary) -> str:
     if math.isnan(summary.iqm_low):
-        return _number(summary.iqm)
-    return f"{_number(summary.iqm)} [{_number(summary.iqm_low)}, {_number(summary.iqm_high)}]"
+        return number(summary.iqm)
+    return f"{number(summary.iqm)} [{number(summary.iqm_low)}, {number(summary.iqm_high)}]"
 
 
-def _number(value: float) -> str:
+def number(value: float) -> str:
     """Four significant digits, but no exponent below a million."""
     if 100 <= abs(value) < 1e6:
         return f"{value:.1f}"
     return f"{value:.4g}"
 
 
-def _row(entries: Sequence[object]) -> str:
+def markdown_row(entries: Sequence[object]) -> str:
+    """A row of a Markdown table."""
     return "| " + " | ".join(_cell_text(entry) for entry in entries) + " |"
 
 

@@ -1,8 +1,9 @@
-"""The pendulum by name: disturbances, ceiling and drawing."""
+"""The pendulum by name: disturbances, baseline, ceiling and drawing."""
 
 from rtd3jax.envs.about import Drawing
 from rtd3jax.envs.pendulum.environment import Pendulum
 from rtd3jax.envs.pendulum.optimum import best_return
+from rtd3jax.envs.pendulum.swing_up import swing_up_policy
 from rtd3jax.envs.processes.disturbances import DampedSine, GaussianNoise, Hidden, Pulses, Sine
 from rtd3jax.envs.registry import register
 
@@ -26,6 +27,7 @@ register(
     },
     positive=("max_speed", "max_torque", "dt", "m", "l"),
     reward_from_observation=("noise",),
+    baselines={"swing-up": swing_up_policy},
     ceiling=best_return,
     drawing=Drawing(
         observation=("cos θ", "sin θ", "angular velocity"),

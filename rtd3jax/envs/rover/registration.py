@@ -1,10 +1,12 @@
-"""The rover by name: disturbances, baseline, ceiling and drawing."""
+"""The rover by name: disturbances, baselines, ceiling and drawing."""
 
 from typing import Any
 
 import jax
 
 from rtd3jax.envs.about import Drawing
+from rtd3jax.envs.controllers import PIDPolicy, pid_policy
+from rtd3jax.envs.interface import describe
 from rtd3jax.envs.registry import register
 from rtd3jax.envs.rover.environment import Rover, RoverState
 from rtd3jax.envs.rover.optimum import best_return
@@ -17,6 +19,18 @@ def constant_command(env: EnvironmentLike) -> tuple[Any, Any]:
     params = env.default_params
     params = getattr(params, "env", params)
     return params.target_speed, params.target_yaw_rate
+
+
+def feedforward_pi(env: EnvironmentLike) -> PIDPolicy | None:
+    """The target fed forward, and a PI controller of both errors; None where one is not seen.
+
+    The first observation shows a rover at rest, which no command has caused: it is ignored. The
+    gains are the best of a grid under ``ar1-slip``, on 1,000 episodes of seed 1000. They are tight:
+    where observations come late or wander, the loop swings, and the constant command does better.
+    """
+    if describe(env, env.default_params).observation_size != 2:
+        return None
+    return pid_policy(env, kp=0.1, ki=1.0, feedforward=constant_command(env), ignored=1)
 
 
 def met_slip(state: RoverState) -> jax.Array | None:
@@ -36,7 +50,7 @@ register(
         "sine-slip": ("slip", SineSlip()),
     },
     positive=("wheelbase", "max_speed", "max_yaw_rate"),
-    baselines={"constant": constant_command},
+    baselines={"constant": constant_command, "feedforward-pi": feedforward_pi},
     ceiling=best_return,
     drawing=Drawing(
         observation=("speed error", "yaw-rate error"),

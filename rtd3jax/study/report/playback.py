@@ -6,34 +6,27 @@ behind it, the action, its reward, and where the environment tells it what the a
 
 import base64
 import dataclasses
-import functools
 import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
 from rtd3jax.envs.about import Drawing
-from rtd3jax.envs.disturbed import Disturbed
-from rtd3jax.envs.entry import parameters_of
-from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT, describe, foreign_code
-from rtd3jax.envs.processes.disturbances import Hidden
-from rtd3jax.envs.processes.process import Chain
+from rtd3jax.envs.disturbed import Disturbed, seen_elements
+from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT
 from rtd3jax.envs.registry import about_of
 from rtd3jax.errors import UserError, first_line
-from rtd3jax.policies.fit import check_fit
+from rtd3jax.evaluation.episode import element_names, play_episodes
 from rtd3jax.protocols import EnvironmentLike, PolicyLike
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.report.data import rows_of
 from rtd3jax.study.results import rounded_number
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.system.files import write_bytes_atomically
-from rtd3jax.system.program_cache import make_room
 
 FORMAT = 2
 EPISODES = 2
@@ -95,49 +88,15 @@ def record_episodes(
     Episodes are those of ``evaluate(policy, env, episodes, seed)``. ``done`` says in which frame an
     episode ended; later frames mean nothing.
     """
-    params = parameters_of(env)
-    own = describe(env, params)
-    check_fit(policy, own.observation_size, own.action_shape, own.action_low, own.action_high)
-    make_room()
-    frames = _play(policy, env, params, jax.random.key(seed), episodes, steps, hidden)
-    return {name: np.asarray(value) for name, value in frames.items()}
-
-
-@functools.partial(jax.jit, static_argnames=("env", "episodes", "steps", "hidden"))
-def _play(policy, env, params, key, episodes, steps, hidden):
-    policy_key, reset_key, step_key = jax.random.split(key, 3)
-    with foreign_code():
-        observation, state = jax.vmap(env.reset, in_axes=(0, None))(
-            jax.random.split(reset_key, episodes), params
-        )
-    memory = jax.vmap(policy.init)(jax.random.split(policy_key, episodes))
-
-    def step(loop, time):
-        memory, state, observation = loop
-        action, memory = jax.vmap(policy.step)(memory, observation)
-        met = None
-        if hidden is not None:
-            met = hidden(state.env if isinstance(env, Disturbed) else state)
-        keys = jax.random.split(jax.random.fold_in(step_key, time), episodes)
-        with foreign_code():
-            observation, state, reward, terminated, truncated, info = jax.vmap(
-                env.step, in_axes=(0, 0, 0, None)
-            )(keys, state, action, params)
-        seen = info["final_observation"].astype(jnp.float32)
-        frame = {
-            "seen": seen,
-            "true": jnp.asarray(info.get("true_observation", seen), jnp.float32),
-            "action": action.reshape(episodes, -1).astype(jnp.float32),
-            "reward": reward.astype(jnp.float32)[:, None],
-            "done": terminated.astype(bool) | truncated.astype(bool),
-        }
-        if met is not None:
-            frame["hidden"] = jnp.asarray(met, jnp.float32).reshape(episodes, -1)
-        return (memory, state, observation.astype(jnp.float32)), frame
-
-    start = (memory, state, observation.astype(jnp.float32))
-    _, frames = jax.lax.scan(step, start, jnp.arange(steps, dtype=jnp.int32))
-    return {name: jnp.swapaxes(value, 0, 1) for name, value in frames.items()}
+    played = play_episodes(policy, env, episodes, seed, steps, hidden)
+    frames = {
+        "seen": played["seen"][:, 1:],
+        "true": played["true"][:, 1:],
+        "action": played["action"],
+        "reward": played["reward"][..., None],
+        "done": played["terminated"] | played["truncated"],
+    }
+    return {**frames, "hidden": played["hidden"]} if "hidden" in played else frames
 
 
 def _recorded(
@@ -172,35 +131,25 @@ def _scene(env: EnvironmentLike, drawing: Drawing, sizes: dict[str, int]) -> dic
         drawing: how it is drawn; what it does not name is numbered.
         sizes: elements of each frame's arrays.
     """
-    params, elements = env.default_params, list(range(sizes["true"]))
+    params = env.default_params
+    elements = seen_elements(env, params, sizes["true"])
     if isinstance(env, Disturbed):
-        process, params = params.observation, params.env
-        processes = process.processes if isinstance(process, Chain) else (process,)
-        for part in processes:
-            if isinstance(part, Hidden):
-                del elements[part.element]
+        params = params.env
     seconds = drawing.step_seconds
     met = None
     if "hidden" in sizes:
-        names = _names(drawing.hidden_elements, "h", sizes["hidden"])
+        names = element_names(drawing.hidden_elements, "h", sizes["hidden"])
         met = {"name": drawing.hidden_name, "elements": names}
     return {
         "kind": drawing.kind,
-        "names": _names(drawing.observation, "o", sizes["true"]),
+        "names": element_names(drawing.observation, "o", sizes["true"]),
         # Which true element each seen one shows; None where that is not known.
         "elements": elements if len(elements) == sizes["seen"] else None,
-        "actions": _names(drawing.action, "a", sizes["action"]),
+        "actions": element_names(drawing.action, "a", sizes["action"]),
         "seconds": None if seconds is None else rounded_number(getattr(params, seconds)),
         "constants": {name: rounded_number(getattr(params, name)) for name in drawing.constants},
         "hidden": met,
     }
-
-
-def _names(given: tuple[str, ...], letter: str, size: int) -> list[str]:
-    """The names given, if there are as many as elements; else numbered ones."""
-    if len(given) == size:
-        return list(given)
-    return [f"{letter}[{k}]" for k in range(size)]
 
 
 def _packed(frames: dict[str, np.ndarray]) -> dict[str, Any]:

@@ -1,0 +1,161 @@
+"""Runs beside each other: the cells that they have in common, with intervals."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from rtd3jax.errors import UserError
+from rtd3jax.study.results import CELL, EPISODES, is_trained, read_table
+from rtd3jax.study.rundir import RunDirectory
+from rtd3jax.study.statistics import compare, seed_means, summarise
+from rtd3jax.study.summary import markdown_row, number
+
+MEASURES = ("return", "true_return")
+
+
+def compare_runs(
+    directories: Sequence[RunDirectory], names: Sequence[str], measure: str = "return"
+) -> pd.DataFrame:
+    """A row for each cell that the first run has in common with another, and each run that has it.
+
+    Args:
+        directories: at least two; the first is the baseline.
+        names: of the runs, distinct.
+        measure: ``return``, or ``true_return`` of the undisturbed state.
+
+    Columns are those of `rtd3jax.study.results.CELL`, ``run``, and the fields of
+    `rtd3jax.study.statistics.Summary` and `rtd3jax.study.statistics.Comparison` with the first run;
+    the first run's own comparison is NaN, with 0 pairs.
+
+    Raises:
+        UserError: for too few runs, a run twice, a run without results, or no cell in common.
+    """
+    if len(directories) < 2:
+        raise UserError("compare takes two runs at least, the baseline first")
+    places = [directory.path.resolve() for directory in directories]
+    for place, directory in enumerate(directories):
+        if places[place] in places[:place]:
+            raise UserError(f"{directory.path} is given twice: compare it with another run")
+    values = [_values(directory, measure) for directory in directories]
+    first, *others = values
+    rows: list[dict[str, Any]] = []
+    for cell in first:
+        if not any(cell in other for other in others):
+            continue
+        for place, (name, of_run) in enumerate(zip(names, values, strict=True)):
+            if cell not in of_run:
+                continue
+            compared = compare({} if place == 0 else first[cell], of_run[cell])
+            summary = summarise(list(of_run[cell].values()))
+            row = dict(zip(CELL, cell, strict=True))
+            rows.append({**row, "run": name, **vars(summary), **vars(compared)})
+    if not rows:
+        has = "; ".join(
+            f"{name} has {_worlds(of_run)}" for name, of_run in zip(names, values, strict=True)
+        )
+        raise UserError(
+            f"no finished cell of {names[0]} (environment, disturbance, agent and history length) "
+            f"is in another run: {has}"
+        )
+    return pd.DataFrame(rows)
+
+
+def differing_settings(
+    directories: Sequence[RunDirectory], names: Sequence[str], table: pd.DataFrame
+) -> list[str]:
+    """A line for each setting in which runs differ in the cells of ``table``; for people."""
+    wanted = set(table[list(CELL)].itertuples(index=False, name=None))
+    found: dict[str, dict[str, list[str]]] = {}
+    for name, directory in zip(names, directories, strict=True):
+        for cell in directory.cells:
+            if tuple(cell.key[column] for column in CELL) in wanted:
+                for field, value in {
+                    **cell.to_dict(),
+                    "final episodes": directory.episodes,
+                }.items():
+                    values = found.setdefault(field, {}).setdefault(name, [])
+                    values += [str(value)] if str(value) not in values else []
+    return [
+        f"{field}: " + ", ".join(f"{' or '.join(own)} ({name})" for name, own in values.items())
+        for field, values in found.items()
+        if len({tuple(own) for own in values.values()}) > 1 and field not in CELL
+    ]
+
+
+def comparison_markdown(
+    table: pd.DataFrame, names: Sequence[str], settings: Sequence[str], measure: str = "return"
+) -> str:
+    """The table of `compare_runs` for people, with what it means; ``settings`` differ."""
+    what = "return" if measure == "return" else "true-state return"
+    lines = [
+        f"# {what[0].upper()}{what[1:]}s of {len(names)} runs",
+        "",
+        f"The interquartile mean (IQM) over seeds, the difference of means to {names[0]}, and the "
+        f"probability that a random seed beats one of {names[0]}; each with its 95 % bootstrap "
+        "interval. A difference is paired where both have at least two equal seeds: so many pairs.",
+        "",
+    ]
+    lines += [f"- differs: {line}" for line in settings] + [""] * bool(settings)
+    header = ["algorithm", "l", "run", "seeds", "IQM [low, high]", "difference [low, high]"]
+    header += ["pairs", "P(better) [low, high]"]
+    for (env, disturbance), of_task in table.groupby(["env", "disturbance"], sort=False):
+        lines += [f"## {env}, {disturbance}", "", markdown_row(header)]
+        lines.append(markdown_row(["---", "---:", "---", *["---:"] * 5]))
+        for row in of_task.to_dict("records"):
+            lost = f" ({row['failed']} lost)" if row["failed"] else ""
+            entries = [row["algorithm"], row["history_length"], row["run"], f"{row['n']}{lost}"]
+            entries += [_interval(row, "iqm")]
+            if row["run"] == names[0]:
+                entries += ["–"] * 3
+            else:
+                entries += [_interval(row, "difference"), row["pairs"] or "–"]
+                entries += [_interval(row, "improvement")]
+            lines.append(markdown_row(entries))
+        lines.append("")
+    for name in names[1:]:
+        chances = table.loc[table["run"] == name, "improvement"].dropna()
+        if len(chances) > 1:
+            lines.append(
+                f"{name}: mean probability of improvement over {len(chances)} cells "
+                f"{chances.mean():.2f}"
+            )
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _values(directory: RunDirectory, measure: str) -> dict[tuple, dict[int, float]]:
+    """The mean final return of each trained seed, by cell."""
+    path = directory.path / "episodes.parquet"
+    if not path.is_file():
+        raise UserError(
+            f"{directory.path} has no results yet: --status tells how far it is, and its sweep "
+            "writes them"
+        )
+    episodes = read_table(path, EPISODES)
+    lanes = seed_means(episodes[is_trained(episodes)])
+    found: dict[tuple, dict[int, float]] = {}
+    for *cell, seed, value in lanes[[*CELL, "seed", measure]].itertuples(index=False, name=None):
+        found.setdefault(tuple(cell), {})[int(seed)] = float(value)
+    return found
+
+
+def _worlds(of_run: Mapping[tuple, Any]) -> str:
+    """What a run consists of, in few words."""
+    worlds: dict[str, dict[str, None]] = {}
+    for env, disturbance, algorithm, length in of_run:
+        agent = f"{algorithm} {length}" if length else algorithm
+        worlds.setdefault(f"{env} {disturbance}", {})[agent] = None
+    return ", ".join(f"{world} ({', '.join(agents)})" for world, agents in worlds.items()) or "none"
+
+
+def _interval(row: Mapping[Any, Any], name: str) -> str:
+    value, low, high = (row[f"{name}{end}"] for end in ("", "_low", "_high"))
+    if not math.isfinite(value):
+        return "–"
+    text = f"{value:.2f}" if name == "improvement" else number(value)
+    if not np.isfinite([low, high]).all():
+        return text
+    ends = [f"{end:.2f}" if name == "improvement" else number(end) for end in (low, high)]
+    return f"{text} [{', '.join(ends)}]"
