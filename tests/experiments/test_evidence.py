@@ -48,7 +48,15 @@ def test_the_rover_experiment_runs_and_says_what_is_missing(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    "name", ["slip_distributions", "parameter_counts", "sizing", "filter_reference"]
+    "name",
+    [
+        "slip_distributions",
+        "parameter_counts",
+        "sizing",
+        pytest.param("filter_reference", marks=pytest.mark.slow),
+        pytest.param("memories", marks=pytest.mark.slow),
+        pytest.param("segments_returns", marks=pytest.mark.slow),
+    ],
 )
 def test_small_experiments_run(name, tmp_path):
     load(EXPERIMENTS / f"{name}.py").main(["--quick", "--out", str(tmp_path)])
