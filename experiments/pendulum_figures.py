@@ -84,9 +84,9 @@ def learning_curves(curves: pd.DataFrame) -> Figure:
     names = [name for name in DISTURBANCES if (curves["disturbance"] == name).any()]
     agents = agents_in(curves)
     figure = Figure(figsize=(2.1 * len(agents) + 1, 1.7 * len(names) + 0.6), layout="constrained")
-    panels = figure.subplots(len(names), len(agents), sharey=True, squeeze=False)
+    panels = figure.subplots(len(names), len(agents), sharex=True, sharey=True, squeeze=False)
     shown: dict[int, object] = {}
-    for row, name in zip(panels, names, strict=True):
+    for number, (row, name) in enumerate(zip(panels, names, strict=True)):
         for axes, agent in zip(row, agents, strict=True):
             own = curves[(curves["disturbance"] == name) & (curves["algorithm"] == agent)]
             for length in lengths_in(own):
@@ -102,7 +102,7 @@ def learning_curves(curves: pd.DataFrame) -> Figure:
             axes.grid(color="#E4E4E4", lw=0.6)
             if own.empty:
                 axes.text(0.5, 0.5, "not run", ha="center", va="center", transform=axes.transAxes)
-            if row is panels[0]:
+            if number == 0:
                 axes.set_title(agent, fontsize=9)
         row[0].set_ylabel(name, fontsize=9)
     figure.supxlabel("thousand steps", fontsize=9)
