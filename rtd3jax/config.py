@@ -34,8 +34,8 @@ def _field(default: object, help: str, *, traced: bool = False, low: float, high
 WINDOWS_WITH_CARRY = (
     "acting='carry' with replay='windows': a memory that was trained on windows has never seen a "
     "carry older than its window; on the pendulum under 'hidden' returns fell from 0.98 to 0.71 of "
-    "the optimum at history_length=6 (docs/how_it_is_fast.md); train with replay='segments', or act "
-    "with windows"
+    "the optimum at history_length=6 (docs/how_it_is_fast.md); train with replay='segments', or "
+    "act with windows"
 )
 
 
