@@ -37,7 +37,7 @@ class Registry(Generic[Entry]):
 
     def check(self, name: object) -> None:
         """Raise UserError unless there is an entry of this name."""
-        if name not in self._entries:
+        if not isinstance(name, str) or name not in self._entries:
             raise UserError(
                 f"{self._kind} {name!r} is unknown{nearest(str(name), tuple(self._entries))}; "
                 f"there are {', '.join(self._entries)}; {self._remedy} adds one"

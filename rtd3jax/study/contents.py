@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from rtd3jax.errors import UserError
+from rtd3jax.registries import AGENTS, MEMORIES
 from rtd3jax.study.plan import Cell, cell_jobs
 from rtd3jax.training.checkpoint import LONGER
 from rtd3jax.training.lanes import Job
@@ -54,14 +55,13 @@ class Contents:
         """
         study = read_config(config)["study"]
         try:
+            for cell in study["cells"]:
+                _check_registered(config, dict(cell))
             cells = tuple(Cell.from_dict(dict(cell)) for cell in study["cells"])
             seeds, episodes = check_seeds(study["seeds"]), int(study["final_episodes"])
             stages = tuple(int(count) for count in study.get("stages", ()))
-        except UserError as error:
-            raise UserError(
-                f"{config}: {error}; register what is your own before you open the study, or name "
-                "its module with --import"
-            ) from error
+        except _NotRegistered:
+            raise
         except (KeyError, TypeError, ValueError) as error:
             raise UserError(f"{config} is not a study's configuration") from error
         return cls(cells, seeds, episodes, stages)
@@ -73,6 +73,20 @@ class Contents:
     def lacks(self, asked: "Contents") -> bool:
         """Whether ``asked`` has something that is not here."""
         return grown(self, asked) != self
+
+
+class _NotRegistered(UserError):
+    """A study of agents or memories that this process does not know."""
+
+
+def _check_registered(config: Path, cell: dict[str, Any]) -> None:
+    for field, known in (("algorithm", AGENTS), ("memory", MEMORIES)):
+        name = cell.get(field)
+        if isinstance(name, str) and name not in known:
+            raise _NotRegistered(
+                f"{config}: {field} {name!r} is not known here, only {', '.join(known)}; register "
+                "what is your own before you open the study, or name its module with --import"
+            )
 
 
 def read_config(config: Path) -> dict[str, Any]:
