@@ -107,13 +107,7 @@ def learning_curves(curves: pd.DataFrame) -> Figure:
         row[0].set_ylabel(name, fontsize=9)
     figure.supxlabel("thousand steps", fontsize=9)
     figure.supylabel("normalised return", fontsize=9)
-    order = sorted(shown)
-    figure.legend(
-        [shown[length] for length in order],
-        [name_of(length) for length in order],
-        loc="outside right upper",
-        fontsize=8,
-    )
+    _legend_of_lengths(figure, shown)
     return figure
 
 
@@ -151,13 +145,7 @@ def final_returns(lanes: pd.DataFrame, filtered: dict[str, float]) -> Figure:
         axes.grid(axis="y", color="#E4E4E4", lw=0.6)
     for axes in panels[:, 0]:
         axes.set_ylabel("normalised return")
-    order = sorted(shown)
-    figure.legend(
-        [shown[length] for length in order],
-        [name_of(length) for length in order],
-        loc="outside right upper",
-        fontsize=8,
-    )
+    _legend_of_lengths(figure, shown)
     return figure
 
 
@@ -194,6 +182,17 @@ def generalisation(moved: pd.DataFrame) -> Figure | None:
         axes.set_ylabel(f"l = {length}\nnormalised return", fontsize=9)
     panels[0].legend(fontsize=7, ncols=3, loc="lower left")
     return figure
+
+
+def _legend_of_lengths(figure: Figure, shown: dict[int, object]) -> None:
+    """A name for the line of each length in ``shown``, beside the panels."""
+    order = sorted(shown)
+    figure.legend(
+        [shown[length] for length in order],
+        [name_of(length) for length in order],
+        loc="outside right upper",
+        fontsize=8,
+    )
 
 
 def _bars(

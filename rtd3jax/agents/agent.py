@@ -128,8 +128,14 @@ class Agent:
         action: jax.Array,
         final_observation: jax.Array,
         history_length: jax.Array,
+        running: Carry | None,
     ) -> Carry:
-        """The carry before an episode's final observation [B, O], after ``action`` [B, A]."""
+        """The carry before an episode's final observation [B, O], after ``action`` [B, A].
+
+        That is ``running``, as `carry_after` gave it, where a carry runs on.
+        """
+        if running is not None:
+            return running
         after = next_window(window, action, final_observation, history_length)
         return carry_before(self.acting, actor, after)
 

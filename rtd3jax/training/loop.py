@@ -17,7 +17,7 @@ from jax.typing import ArrayLike
 
 from rtd3jax.agents.agent import Agent, make_agent
 from rtd3jax.agents.bounds import Bounds
-from rtd3jax.agents.history import Steps, Window
+from rtd3jax.agents.history import Steps
 from rtd3jax.agents.hyperparameters import Hyperparameters
 from rtd3jax.agents.memory.base import Carry, Params
 from rtd3jax.agents.noise import add_noise
@@ -227,8 +227,13 @@ class Program:
                 age=state.age,
             ),
             done,
-            final_carry=lambda: self._final_carry(
-                learner.actor, window, action, final_observation, numbers, carry
+            final_carry=lambda: self.agent.final_carry(
+                learner.actor,
+                window,
+                action[None],
+                final_observation[None],
+                numbers.history_length,
+                carry,
             ),
             # Losses are not negative, and actions not above one.
             never=(loss < 0.0) & jnp.all(action > 1.0),
@@ -248,22 +253,6 @@ class Program:
         state = _note_failure(state, step, ~finite, ENVIRONMENT_NOT_FINITE)
         state = _note_failure(state, step, ~jnp.isfinite(loss), LOSS_NOT_FINITE)
         return self._evaluate(lane, state, step + 1)
-
-    def _final_carry(
-        self,
-        actor: Params,
-        window: Window,
-        action: jax.Array,
-        final_observation: jax.Array,
-        numbers: Hyperparameters,
-        running: Carry | None,
-    ) -> Carry:
-        """The actor's carry before an episode's final observation [O], after ``action`` [A]."""
-        if running is not None:
-            return running
-        return self.agent.final_carry(
-            actor, window, action[None], final_observation[None], numbers.history_length
-        )
 
     def _explore(
         self, greedy: jax.Array, key: jax.Array, numbers: Hyperparameters, step: jax.Array
