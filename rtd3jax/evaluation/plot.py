@@ -6,6 +6,7 @@ import numpy as np
 
 from rtd3jax.errors import UserError
 from rtd3jax.evaluation.episode import Trajectory
+from rtd3jax.evaluation.style import STYLE
 
 if TYPE_CHECKING:  # with it come two seconds of imports
     from matplotlib.axes import Axes
@@ -18,17 +19,7 @@ _TRUE, _SEEN, _OTHER = "#222222", "#D55E00", "#0072B2"
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#222222", "#999999")
 """Of several lines in a panel; told apart by the colour-blind too."""
 
-_STYLE: Any = {
-    "font.size": 9.0,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "grid.color": "#E4E4E4",
-    "grid.linewidth": 0.6,
-    "legend.frameon": False,
-    "legend.fontsize": 8.0,
-}
+_STYLE: Any = {**STYLE, "legend.fontsize": 8.0}
 
 
 def plot_episode(trajectory: Trajectory, episode: int = 0) -> "Figure":

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
+from rtd3jax.evaluation.style import STYLE
 from rtd3jax.study.colours import colour_of, ordered
 from rtd3jax.study.results import is_trained, reference_names, write_bytes_atomically
 from rtd3jax.study.statistics import iqm_bands, seed_means, summarise
@@ -38,16 +39,9 @@ MARKERS = "osD^vPX"
 CLIPPED_SHARE = 0.25
 
 _STYLE: Any = {
+    **STYLE,
     "svg.hashsalt": "rtd3jax",  # otherwise element ids are random
-    "font.size": 9.0,
     "axes.titlesize": 9.5,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "grid.color": "#E4E4E4",
-    "grid.linewidth": 0.6,
-    "legend.frameon": False,
 }
 
 
