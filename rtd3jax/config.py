@@ -140,6 +140,13 @@ class Config:
             "window]"
         },
     )
+    normalise_observations: bool = dataclasses.field(
+        default=False,
+        metadata={
+            "help": "whether networks read each element of an observation in running deviations "
+            "about its running mean; for plants whose elements differ much in size"
+        },
+    )
     precision: str = dataclasses.field(
         default="float32",
         metadata={
@@ -201,10 +208,10 @@ class Config:
                     f"{name} {value!r} is unknown{nearest(str(value), named)}; there are "
                     f"{' and '.join(named)}"
                 )
-        if not isinstance(self.burn_in_gradient, bool):
-            raise UserError(
-                f"burn_in_gradient must be True or False, not {self.burn_in_gradient!r}"
-            )
+        for name in ("burn_in_gradient", "normalise_observations"):
+            value = getattr(self, name)
+            if not isinstance(value, bool):
+                raise UserError(f"{name} must be True or False, not {value!r}")
         segments = self.replay == "segments" and self.has_window
         resolved: dict[str, Any] = {"replay": "segments" if segments else "windows"}
         if self.acting is None or not self.has_window:

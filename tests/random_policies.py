@@ -15,7 +15,16 @@ LENGTH = 3
 
 
 def random_policy(
-    algorithm, env, *, width=8, length=LENGTH, seed=0, scale=3.0, memory="lstm", acting="window"
+    algorithm,
+    env,
+    *,
+    width=8,
+    length=LENGTH,
+    seed=0,
+    scale=3.0,
+    memory="lstm",
+    acting="window",
+    normaliser=None,
 ):
     """An untrained policy whose weights before the output are ``scale`` times their usual size."""
     interface = describe(env, env.default_params)
@@ -42,4 +51,5 @@ def random_policy(
         action_shape=interface.action_shape,
         memory=memory,
         acting=acting,
+        normaliser=normaliser,
     )

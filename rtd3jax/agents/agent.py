@@ -23,6 +23,7 @@ from rtd3jax.agents.networks import (
     make_network,
     part_sizes,
 )
+from rtd3jax.agents.normalise import Normaliser, Statistics, no_statistics, normalised
 from rtd3jax.agents.replay import Batch, Replay, empty_replay, sample, sample_segments
 from rtd3jax.agents.variants import Variant
 from rtd3jax.config import Config
@@ -97,6 +98,10 @@ class Agent:
         """The running carry, leaves [1, ...], before an episode's first step; None with windows."""
         return self.acting.zero_carry(1) if self.has_running_carry else None
 
+    def no_statistics(self) -> Statistics | None:
+        """Those of no observation yet; None where networks read observations as they are."""
+        return no_statistics(self.observation_size) if self.config.normalise_observations else None
+
     def act(
         self, actor: Params, window: Window, running: Carry | None
     ) -> tuple[jax.Array, Carry | None]:
@@ -140,9 +145,24 @@ class Agent:
         return carry_before(self.acting, actor, after)
 
     def sample(
+        self,
+        replay: Replay,
+        key: jax.Array,
+        count: jax.Array,
+        history_length: jax.Array,
+        normaliser: Normaliser | None,
+    ) -> Batch:
+        """A batch of the ``count`` steps written so far, as networks read them."""
+        batch = self._sample(replay, key, count, history_length)
+        return dataclasses.replace(
+            batch,
+            window=normalised(batch.window, normaliser),
+            next_window=normalised(batch.next_window, normaliser),
+        )
+
+    def _sample(
         self, replay: Replay, key: jax.Array, count: jax.Array, history_length: jax.Array
     ) -> Batch:
-        """A batch of the ``count`` steps written so far."""
         config = self.config
         rows = replay, key, count, config.batch_size, config.tokens, history_length
         if config.replay == "segments":

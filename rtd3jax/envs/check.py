@@ -285,7 +285,8 @@ def _scales(record: _Record) -> Iterator[Finding]:
         yield Finding(
             "scale",
             f"the observation's sizes are far from one: {few}{more}",
-            "networks read it as it is: divide each element by its usual size",
+            "networks read it as it is: train with normalise_observations=True "
+            "(--normalise-observations), or divide each element by its usual size",
             advice=True,
         )
     size = float(np.sqrt(np.mean(record.reward.astype(np.float64) ** 2)))

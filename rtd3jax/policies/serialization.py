@@ -15,14 +15,15 @@ from rtd3jax.agents.agent import make_part
 from rtd3jax.agents.bounds import Bounds
 from rtd3jax.agents.memory.base import Params
 from rtd3jax.agents.networks import NetworkSpec, init_network, part_sizes
+from rtd3jax.agents.normalise import Normaliser
 from rtd3jax.config import ACTINGS
 from rtd3jax.envs.interface import Interface
 from rtd3jax.errors import UserError
-from rtd3jax.policies.trained import CARRY_FORMAT, FORMAT, KIND, Policy
+from rtd3jax.policies.trained import CARRY_FORMAT, FORMAT, KIND, NORMALISED_FORMAT, Policy
 from rtd3jax.registries import AGENTS, MEMORIES
 from rtd3jax.system.files import flatten, read_arrays, unflatten
 
-_FORMATS = (1, FORMAT, CARRY_FORMAT)
+_FORMATS = (1, FORMAT, CARRY_FORMAT, NORMALISED_FORMAT)
 _ACTIONS = ("action", "previous_action")
 _OLD_NAME = re.compile(r"^lstm\.")
 """How the memory's arrays began when the LSTM was the only one."""
@@ -46,10 +47,14 @@ def read_policy(path: str | os.PathLike) -> Policy:
     if about.get("format") not in _FORMATS:
         raise UserError(
             f"{path} has format {about.get('format')}, and this version of rtd3jax reads up to "
-            f"{CARRY_FORMAT}: use the version that wrote it, or a newer one"
+            f"{NORMALISED_FORMAT}: use the version that wrote it, or a newer one"
         )
     interface, facts = _header(path, about)
-    return restore_policy(path, arrays, interface, **facts)
+    normaliser = below(arrays, "normaliser")
+    if (about["format"] == NORMALISED_FORMAT) != bool(normaliser):
+        raise UserError(f"{path} is damaged: its arrays do not go with its format")
+    actor = {name: array for name, array in arrays.items() if not name.startswith("normaliser.")}
+    return restore_policy(path, actor, interface, normaliser=normaliser, **facts)
 
 
 def restore_policy(
@@ -64,6 +69,7 @@ def restore_policy(
     acting: str = "window",
     format: int = FORMAT,
     centre_token: np.ndarray | None = None,
+    normaliser: Mapping[str, np.ndarray] | None = None,
 ) -> Policy:
     """The policy of an actor's arrays under dotted names.
 
@@ -78,6 +84,7 @@ def restore_policy(
         acting: ``window`` or ``carry``, as in the policy.
         format: of the file; an actor of format 1 is converted.
         centre_token: [A], as in the policy; zero by default.
+        normaliser: its ``mean`` and ``scale`` [O]; None or empty without one.
 
     Raises:
         UserError: when an array is missing, too many, of another shape or type, or not finite.
@@ -124,7 +131,29 @@ def restore_policy(
         action_shape=interface.action_shape,
         memory=memory,
         acting=acting,
+        normaliser=_normaliser(path, normaliser, interface.observation_size),
     )
+
+
+def below(arrays: Mapping[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
+    """The arrays whose dotted names begin with ``name``, without it."""
+    return {n.removeprefix(f"{name}."): a for n, a in arrays.items() if n.startswith(f"{name}.")}
+
+
+def _normaliser(
+    path: str | os.PathLike, arrays: Mapping[str, np.ndarray] | None, size: int
+) -> Normaliser | None:
+    if not arrays:
+        return None
+    if set(arrays) != {"mean", "scale"}:
+        raise UserError(f"{path} is damaged: its normaliser has {', '.join(arrays)}")
+    for name, array in arrays.items():
+        sound = array.shape == (size,) and array.dtype == np.float32 and np.isfinite(array).all()
+        if not sound:
+            raise UserError(
+                f"{path} is damaged: its normaliser's {name} is not {size} finite numbers"
+            )
+    return Normaliser(jnp.asarray(arrays["mean"]), jnp.asarray(arrays["scale"]))
 
 
 def _in_half_ranges(

@@ -13,6 +13,7 @@ from rtd3jax.agents.bounds import Bounds
 from rtd3jax.agents.history import Steps, empty_steps, present, put_step, window_at
 from rtd3jax.agents.memory.base import Carry, Params
 from rtd3jax.agents.networks import Network, act, advance
+from rtd3jax.agents.normalise import Normaliser, as_read
 from rtd3jax.errors import UserError
 from rtd3jax.policies.export.formats import writer_of
 from rtd3jax.policies.export.model import Model, fold
@@ -28,6 +29,9 @@ Actors of format 1 read actions in the environment's units."""
 CARRY_FORMAT = 3
 """Of saved policies that act with a running carry; else as `FORMAT`."""
 
+NORMALISED_FORMAT = 4
+"""Of saved policies that normalise observations; else as `CARRY_FORMAT` says."""
+
 KIND = "policy"
 
 
@@ -36,7 +40,7 @@ class PolicyState:
     """What a policy remembers within an episode.
 
     Attributes:
-        steps: ring of the last L steps; None where a carry runs on.
+        steps: ring of the last L steps, as the networks read them; None where a carry runs on.
         previous_action: [A], as tokens hold it; zero before the first step.
         time: int32 [], steps done in the episode.
         carry: the memory's, leaves [1, ...], where it runs on from the episode's start; else None.
@@ -65,6 +69,7 @@ class Policy:
         memory: the name of its recurrent cell.
         acting: ``window`` reads the last l steps at every step; ``carry`` goes on with the memory's
             carry from the episode's start, which costs one token whatever l is.
+        normaliser: maps each observation before the network reads it; None for none.
     """
 
     actor: Params
@@ -77,6 +82,7 @@ class Policy:
     action_shape: tuple[int, ...] = struct.field(pytree_node=False)
     memory: str = struct.field(pytree_node=False, default="lstm")
     acting: str = struct.field(pytree_node=False, default="window")
+    normaliser: Normaliser | None = None
 
     @property
     def width(self) -> int:
@@ -145,6 +151,7 @@ class Policy:
         )
 
     def _step(self, state: PolicyState, observation: jax.Array) -> tuple[jax.Array, PolicyState]:
+        observation = as_read(observation, self.normaliser)
         if state.steps is None:
             return self._step_with_carry(state, observation)
         time = state.time[None]
@@ -184,7 +191,7 @@ class Policy:
                 weights are not finite; for a batch of policies.
         """
         check_target(path, overwrite)
-        write_new(path, array_bytes(flatten(self._actor()), self._about()), overwrite)
+        write_new(path, array_bytes(self._arrays(), self._about()), overwrite)
 
     def export(self, path: str | os.PathLike, format: str, overwrite: bool = False) -> None:
         """Write the policy in a form that runs without rtd3jax.
@@ -209,7 +216,14 @@ class Policy:
             history_length=int(self.history_length),
             observation_size=self.observation_size,
             action_shape=self.action_shape,
-            arrays=fold(actor, cell, self.bounds.low, self.bounds.high, self.centre_token),
+            arrays=fold(
+                actor,
+                cell,
+                self.bounds.low,
+                self.bounds.high,
+                self.centre_token,
+                self.normaliser,
+            ),
             about=self._about(),
             cell=cell,
             network=self.network,
@@ -228,6 +242,20 @@ class Policy:
                 raise UserError(f"the policy's weights are not finite ({name}); it cannot be used")
         return actor
 
+    def _arrays(self) -> dict[str, np.ndarray]:
+        """What a saved policy holds."""
+        return {**flatten(self._actor()), **self._normaliser_arrays()}
+
+    def _normaliser_arrays(self) -> dict[str, np.ndarray]:
+        if self.normaliser is None:
+            return {}
+        names = ("mean", "scale")
+        return {f"normaliser.{n}": np.asarray(getattr(self.normaliser, n)) for n in names}
+
+    def parameters(self) -> dict[str, np.ndarray]:
+        """All that was learned, under dotted names: ``actor...`` and ``normaliser...``."""
+        return {**flatten(self.actor, "actor"), **self._normaliser_arrays()}
+
     def interface(self) -> dict[str, Any]:
         """Sizes and bounds of the environment that it is for, as headers of files hold them."""
         return {
@@ -237,11 +265,17 @@ class Policy:
             "action_high": np.asarray(self.bounds.high).tolist(),
         }
 
+    @property
+    def _format(self) -> int:
+        if self.normaliser is not None:
+            return NORMALISED_FORMAT
+        return CARRY_FORMAT if self.acting == "carry" else FORMAT
+
     def _about(self) -> dict[str, Any]:
         """The header of a file that holds the policy."""
         return {
             "kind": KIND,
-            "format": CARRY_FORMAT if self.acting == "carry" else FORMAT,
+            "format": self._format,
             "algorithm": self.algorithm,
             "history_length": int(self.history_length),
             **self.interface(),

@@ -100,8 +100,8 @@ class Recorder:
         returns, true_returns = curves_of(cell.config, state, failure)
         final = np.full((2, self._directory.episodes), np.nan, np.float32)
         interface = None
+        policy = job.program.policy(job.lane, state)
         if failure is None:
-            policy = job.program.policy(job.lane, state.learner.actor)
             interface = policy.interface()
             final = np.stack(both_returns(policy, cell.make_env(), self._directory.episodes, seed))
         else:
@@ -111,7 +111,7 @@ class Recorder:
         self._directory.write_lane(
             cell,
             seed,
-            state.learner.actor,
+            policy.parameters(),
             {
                 "steps": evaluation_steps(cell.config),
                 "returns": returns,

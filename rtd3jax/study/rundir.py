@@ -19,7 +19,7 @@ import numpy as np
 
 from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
-from rtd3jax.policies.serialization import read_interface, restore_policy
+from rtd3jax.policies.serialization import below, read_interface, restore_policy
 from rtd3jax.policies.trained import FORMAT, Policy
 from rtd3jax.study.ceilings import ceilings_of
 from rtd3jax.study.contents import (
@@ -44,7 +44,6 @@ from rtd3jax.study.results import (
 )
 from rtd3jax.study.summary import summary_markdown
 from rtd3jax.system.files import (
-    flatten,
     read_about,
     read_arrays,
     user_path,
@@ -293,7 +292,7 @@ class RunDirectory:
         self,
         cell: Cell,
         seed: int,
-        actor: Any,
+        parameters: dict[str, np.ndarray],
         curves: dict[str, np.ndarray],
         metrics: dict[str, np.ndarray],
         failure: dict[str, Any] | None,
@@ -304,7 +303,7 @@ class RunDirectory:
         Args:
             cell: its cell.
             seed: its seed.
-            actor: parameters of the actor, a nested dict.
+            parameters: of its policy, as `Policy.parameters` names them.
             curves: ``steps``, ``returns``, ``true_returns`` [K] and ``final_returns``,
                 ``final_true_returns`` [episodes].
             metrics: of learning, [K] by name.
@@ -312,7 +311,7 @@ class RunDirectory:
             interface: what `Policy.interface` says of its policy, which then can be loaded where
                 the cell's environment is not registered.
         """
-        arrays = {f"actor.{name}": value for name, value in flatten(actor).items()}
+        arrays = dict(parameters)
         arrays |= {f"results.{name}": np.asarray(value) for name, value in curves.items()}
         arrays |= {f"metrics.{name}": np.asarray(value) for name, value in metrics.items()}
         about = {"format": FORMAT, "cell": cell.to_dict(), "seed": seed, "failure": failure}
@@ -343,8 +342,9 @@ class RunDirectory:
             interface = describe(env, env.default_params)
         return restore_policy(
             path,
-            {n.removeprefix("actor."): a for n, a in arrays.items() if n.startswith("actor.")},
+            below(arrays, "actor"),
             interface,
+            normaliser=below(arrays, "normaliser"),
             algorithm=cell.config.algorithm,
             history_length=cell.config.tokens,
             width=cell.config.hidden_size,

@@ -19,8 +19,9 @@ from rtd3jax.agents.agent import Agent, make_agent
 from rtd3jax.agents.bounds import Bounds
 from rtd3jax.agents.history import Steps
 from rtd3jax.agents.hyperparameters import Hyperparameters
-from rtd3jax.agents.memory.base import Carry, Params
+from rtd3jax.agents.memory.base import Carry
 from rtd3jax.agents.noise import add_noise
+from rtd3jax.agents.normalise import Normaliser, Statistics, as_read, normalised
 from rtd3jax.agents.replay import (
     Replay,
     Transition,
@@ -70,6 +71,7 @@ class LaneState:
     Attributes:
         learner: networks and optimisers, as the agent's learner keeps them.
         replay: what was seen.
+        statistics: of the observations seen, where networks read them normalised; else None.
         env_state: the environment's own.
         observation: [O], the one to act upon.
         previous_action: [A], in half ranges as all actions of an agent; zero at an episode's start.
@@ -84,6 +86,7 @@ class LaneState:
 
     learner: Any
     replay: Replay
+    statistics: Statistics | None
     env_state: Any
     observation: jax.Array
     previous_action: jax.Array
@@ -147,6 +150,7 @@ class Program:
         return LaneState(
             learner=self.agent.init(jax.random.fold_in(key, _INIT)),
             replay=self.agent.empty_replay(),
+            statistics=self.agent.no_statistics(),
             env_state=env_state,
             observation=observation.astype(jnp.float32),
             previous_action=jnp.zeros((self.action_size,), jnp.float32),
@@ -163,10 +167,11 @@ class Program:
         """The lane after steps ``start`` to ``stop - 1`` (int32 []), however they are cut."""
         return lax.fori_loop(start, stop, lambda step, s: self._step(lane, s, step), state)
 
-    def policy(self, lane: Lane, actor: Params) -> Policy:
-        """The deterministic policy of these actor parameters."""
+    def policy(self, lane: Lane, state: LaneState) -> Policy:
+        """The deterministic policy that the lane has learned."""
         return Policy(
-            actor=actor,
+            actor=state.learner.actor,
+            normaliser=_normaliser(state.statistics),
             bounds=self.bounds(lane),
             history_length=lane.hyperparameters.history_length,
             centre_token=jnp.zeros((self.action_size,), jnp.float32),
@@ -189,7 +194,11 @@ class Program:
             jax.random.fold_in(jax.random.fold_in(root, _STEPS), step), 3
         )
 
-        window = present_window(
+        statistics = state.statistics
+        if statistics is not None:
+            statistics = statistics.note(state.observation)
+        normaliser = _normaliser(statistics)
+        present = present_window(
             state.replay,
             step,
             state.age,
@@ -198,13 +207,14 @@ class Program:
             self.agent.acting_tokens,
             numbers.history_length,
         )
+        window = normalised(present, normaliser)
         greedy, kept = self.agent.act(state.learner.actor, window, state.carry)
         action = self._explore(greedy, act_key, numbers, step)
         carry = self.agent.carry_after(state.learner.actor, window, action[None], state.carry)
         replay = keep_acting_carry(state.replay, step, state.age, kept)
 
         learner, metrics, loss = self._learn(
-            state.learner, replay, state.metrics, learn_key, numbers, step
+            state.learner, replay, normaliser, state.metrics, learn_key, numbers, step
         )
 
         command = self.bounds(lane).to_environment(action).reshape(self.action_shape)
@@ -231,7 +241,7 @@ class Program:
                 learner.actor,
                 window,
                 action[None],
-                final_observation[None],
+                as_read(final_observation[None], normaliser),
                 numbers.history_length,
                 carry,
             ),
@@ -243,6 +253,7 @@ class Program:
             state,
             learner=learner,
             replay=replay,
+            statistics=statistics,
             env_state=env_state,
             observation=observation.astype(jnp.float32),
             previous_action=jnp.where(done, 0.0, action),
@@ -267,6 +278,7 @@ class Program:
         self,
         learner: Any,
         replay: Replay,
+        normaliser: Normaliser | None,
         metrics: Averages,
         key: jax.Array,
         numbers: Hyperparameters,
@@ -281,7 +293,7 @@ class Program:
         numbers = numbers.at(step.astype(jnp.float32) / config.total_steps)
 
         def learn(learner: Any, metrics: Averages) -> tuple[Any, Averages, jax.Array]:
-            batch = self.agent.sample(replay, keys[0], step, numbers.history_length)
+            batch = self.agent.sample(replay, keys[0], step, numbers.history_length, normaliser)
             learner, found = self.agent.update(learner, batch, keys[1:], numbers, count)
             return learner, note_update(metrics, found), found["critic_loss"].total
 
@@ -298,7 +310,7 @@ class Program:
         def evaluate(curves):
             returns, true_returns, metrics = curves
             key = jax.random.fold_in(jax.random.key(lane.seed), _EVALUATION)
-            policy = self.policy(lane, state.learner.actor)
+            policy = self.policy(lane, state)
             totals = episode_returns(
                 policy,
                 self.env,
@@ -351,6 +363,10 @@ def make_lane(config: Config, seed: int, env_params: object) -> Lane:
 
 def _array(leaf: ArrayLike) -> jax.Array:
     return jnp.asarray(leaf, jnp.float32 if isinstance(leaf, float) else None)
+
+
+def _normaliser(statistics: Statistics | None) -> Normaliser | None:
+    return None if statistics is None else statistics.normaliser()
 
 
 def _note_failure(state: LaneState, step: jax.Array, seen: jax.Array, code: int) -> LaneState:

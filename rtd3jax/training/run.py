@@ -262,7 +262,7 @@ def collect(
         returns.append(curve)
         true_returns.append(true_curve)
         metrics.append(metric_curves(config, state, failure))
-        policies.append(None if failure else job.program.policy(job.lane, state.learner.actor))
+        policies.append(None if failure else job.program.policy(job.lane, state))
         failures += [failure] if failure else []
     return Run(
         config,

@@ -114,7 +114,8 @@ def test_arrays_that_do_not_fit_are_refused(tmp_path, policy, change, message):
 @pytest.mark.parametrize(
     "changes, message",
     [
-        ({"format": 4}, "has format 4, .* reads up to 3"),
+        ({"format": 5}, "has format 5, .* reads up to 4"),
+        ({"format": 4}, "arrays do not go with its format"),
         ({"centre_token": [0.0]}, "centre_token is not 2 numbers"),
         ({"kind": "shopping list"}, "is not a saved policy"),
         ({"algorithm": "ppo"}, "agent .ppo. is not known here"),

@@ -29,6 +29,7 @@ from jax.typing import ArrayLike
 
 from rtd3jax.agents.memory.base import Params
 from rtd3jax.agents.networks import Linear, Network
+from rtd3jax.agents.normalise import LIMIT, Normaliser
 from rtd3jax.errors import UserError
 
 GATES = "ifog"
@@ -115,6 +116,7 @@ def fold(
     low: ArrayLike,
     high: ArrayLike,
     centre_token: ArrayLike,
+    normaliser: Normaliser | None = None,
 ) -> dict[str, np.ndarray]:
     """An actor's parameters as float32 arrays: an LSTM's biases merged, its gates as in `GATES`.
 
@@ -124,8 +126,9 @@ def fold(
         low: [A], the action's lower bound.
         high: [A], its upper bound.
         centre_token: [A], what tokens hold for an action at the centre; left out where it is zero.
+        normaliser: of observations; left out where there is none.
     """
-    arrays = {}
+    arrays: dict[str, ArrayLike] = {}
     for layer in ("encoder", "current", "head", "output"):
         if set(actor.get(layer, ())) == {"kernel", "bias"}:
             arrays[f"{layer}_kernel"] = actor[layer]["kernel"]
@@ -144,6 +147,10 @@ def fold(
     arrays["action_half_range"] = np.float32(0.5) * (high - low)
     if np.any(centre_token):
         arrays["centre_token"] = centre_token
+    if normaliser is not None:
+        arrays["observation_mean"] = normaliser.mean
+        arrays["observation_scale"] = normaliser.scale
+        arrays["observation_limit"] = LIMIT
     return {name: np.array(value, np.float32, order="C") for name, value in arrays.items()}
 
 

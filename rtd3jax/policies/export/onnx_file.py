@@ -96,6 +96,7 @@ class _Graph:
 
 def _build(graph: _Graph, model: Model) -> None:
     features = []
+    observation = _normalised_observation(graph, model)
     length = model.history_length
     carry: list[str] = []
     if model.memory:
@@ -104,14 +105,23 @@ def _build(graph: _Graph, model: Model) -> None:
             pads = graph.integers(0, 1, 0, 0, 0, 0)  # a zero row: the carry that begins now
             carry = [graph.add("Pad", [part, pads]) for part in carry]
         if model.memory_has_current:
-            carry = _feed(graph, model, carry)
+            carry = _feed(graph, model, carry, observation)
         if model.runs_on:
             features.append(carry[0])
         else:
             features.append(_row(graph, carry[0], length))
             carry = [_rows(graph, part, length) for part in carry]
     if model.current:
-        features.append(graph.add("Relu", [graph.linear("current", graph.join(model.current))]))
+        features.append(
+            graph.add(
+                "Relu",
+                [
+                    graph.linear(
+                        "current", graph.join(_named(model.current, observation=observation))
+                    )
+                ],
+            )
+        )
     head = graph.add("Relu", [graph.linear("head", graph.join(features))])
     token = graph.add("Tanh", [graph.linear("output", head)], "action_token")
     scaled = graph.add("Mul", [token, graph.weight("action_half_range")])
@@ -120,7 +130,7 @@ def _build(graph: _Graph, model: Model) -> None:
     if "centre_token" in model.arrays:
         token = graph.add("Add", [token, graph.weight("centre_token")], "shifted_action_token")
     if model.memory and not model.memory_has_current:
-        carry = _feed(graph, model, carry, token)
+        carry = _feed(graph, model, carry, observation, token)
     following = {"previous_action": token}
     if model.memory:
         following |= dict(zip(_CARRIES[model.cell], carry, strict=True))
@@ -135,12 +145,29 @@ _CARRIES: dict[str | None, tuple[str, ...]] = {
 }
 
 
-def _feed(graph: _Graph, model: Model, carry: list[str], action: str = "") -> list[str]:
+def _normalised_observation(graph: _Graph, model: Model) -> str:
+    """The observation as the network reads it."""
+    if "observation_mean" not in model.arrays:
+        return "observation"
+    limit = graph.weight("observation_limit")
+    centred = graph.add("Sub", ["observation", graph.weight("observation_mean")])
+    scaled = graph.add("Mul", [centred, graph.weight("observation_scale")])
+    return graph.add("Clip", [scaled, graph.add("Neg", [limit]), limit])
+
+
+def _named(parts: Sequence[str], **names: str) -> list[str]:
+    """Names of the values that hold these parts of a token."""
+    return [names.get(part, part) for part in parts]
+
+
+def _feed(
+    graph: _Graph, model: Model, carry: list[str], observation: str, action: str = ""
+) -> list[str]:
     """The carries [B, rows, H], or [B, H] of one that runs on, after the step's token.
 
     ``action`` is for where a token has it.
     """
-    parts = [action if part == "action" else part for part in model.memory]
+    parts = _named(model.memory, observation=observation, action=action)
     token = graph.add("Relu", [graph.linear("encoder", graph.join(parts))])
     token = graph.linear("input", token)
     if not model.runs_on:

@@ -39,6 +39,9 @@ class Player:
         }
         self._centre, self._half_range = arrays["action_centre"], arrays["action_half_range"]
         self._centre_token = arrays.get("centre_token")
+        self._mean = arrays.get("observation_mean")
+        if self._mean is not None:
+            self._scale, self._limit = arrays["observation_scale"], arrays["observation_limit"]
         self._runs_on: bool = about["acting"] == "carry"
         self._length: int = 1 if self._runs_on else about["history_length"]
         self._with_current: bool = about["memory_has_current"]
@@ -84,6 +87,9 @@ class Player:
             )
         if not np.isfinite(observation).all():
             raise ValueError(f"the observation {observation} is not finite")
+        if self._mean is not None:
+            observation = (observation - self._mean) * self._scale
+            observation = np.minimum(np.maximum(observation, -self._limit), self._limit)
         parts = {"observation": observation, "previous_action": self._previous_action}
         features = []
         if self.about["memory"]:

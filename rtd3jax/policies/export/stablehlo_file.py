@@ -67,7 +67,7 @@ def play(
     own step.
     """
     network, variables = model.network, {"params": params}
-    parts = {"observation": observation}
+    parts = {"observation": _normalised(observation, arrays)}
     if "previous_action" in state:
         parts["previous_action"] = state["previous_action"]
     batch = observation.shape[0]
@@ -115,6 +115,14 @@ def play(
     following = {"previous_action": token, **dict(zip(names, carry, strict=True))}
     action = action.reshape(-1, *model.action_shape)
     return action, {name: following[name] for name in model.state_shapes}
+
+
+def _normalised(observation: jax.Array, arrays: State) -> jax.Array:
+    if "observation_mean" not in arrays:
+        return observation
+    limit = arrays["observation_limit"]
+    centred = observation - arrays["observation_mean"][None, :]
+    return jnp.clip(centred * arrays["observation_scale"][None, :], -limit, limit)
 
 
 def _with_zero_row(rows: jax.Array) -> jax.Array:

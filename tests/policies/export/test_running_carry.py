@@ -1,12 +1,14 @@
 """A carry that runs on from the episode's start: what it equals in every form, and its size."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from random_policies import random_policy
 from test_closed_loop import PLAYERS
 
 import rtd3jax as rtd
+from rtd3jax.agents.normalise import Normaliser
 from rtd3jax.policies.export.formats import FORMATS
 
 STEPS = 20
@@ -53,6 +55,30 @@ def test_it_acts_as_a_window_of_the_whole_episode_in_every_form(
     loaded = rtd.load_policy(tmp_path / "p.safetensors")
     assert loaded.acting == "carry"
     np.testing.assert_array_equal(_actions(loaded, observations), _actions(policy, observations))
+
+
+@pytest.mark.parametrize("acting", ["window", "carry"])
+@pytest.mark.parametrize("agent", ["td3", "lstm-td3", "lstm-td3-1ha1hc"])
+def test_every_form_normalises_as_the_policy_does(tmp_path, env, observations, agent, acting):
+    normaliser = Normaliser(jnp.float32([1e3, -2e-3]), jnp.float32([1e-2, 1e3]))
+    raw = observations / np.float32([1e-2, 1e3]) + np.float32([1e3, -2e-3])
+    raw[3] = 1e6  # beyond the limit
+    plain = random_policy(agent, env, scale=2.0, acting=acting)
+    policy = plain.replace(normaliser=normaliser)
+    want = _actions(policy, raw)
+    read = np.clip((raw - np.asarray(normaliser.mean)) * np.asarray(normaliser.scale), -10, 10)
+    np.testing.assert_allclose(want, _actions(plain, read), atol=1e-5)
+    for form in FORMATS:
+        path = tmp_path / ("p" + FORMATS[form][0])
+        policy.export(path, format=form)
+        player = PLAYERS[form](path)
+        player.reset()
+        found = np.stack([player.step(row) for row in raw])
+        np.testing.assert_allclose(found, want, atol=1e-5, err_msg=form)
+    policy.save(tmp_path / "p.safetensors")
+    loaded = rtd.load_policy(tmp_path / "p.safetensors")
+    jax.tree.map(np.testing.assert_array_equal, loaded.normaliser, normaliser)
+    np.testing.assert_allclose(_actions(loaded, raw), want, atol=1e-6)
 
 
 def test_its_state_does_not_grow_with_the_history(env):
