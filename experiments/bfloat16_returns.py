@@ -18,27 +18,22 @@ import pandas as pd
 from scipy import stats
 
 import rtd3jax as rtd
-from rtd3jax import sweep
+from rtd3jax.study.presets import ROVER_HISTORY_LENGTH, ROVER_SETTINGS, ROVER_STEPS
 from rtd3jax.study.rundir import RunDirectory
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-from rover import EPISODES, HISTORY_LENGTH, SEEDS, SETTINGS, STEPS  # noqa: E402
-from settings import flags  # noqa: E402
+from rover import EPISODES, SEEDS  # noqa: E402
 from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
 
 AGENT, DISTURBANCE = "lstm-td3-1ha1hc", "ar1-slip"
 
 
-def train(run: pathlib.Path, precision: str, more: list[str]) -> int:
-    """Train what is missing; the sweep's exit status."""
-    settings = {**SETTINGS, "precision": precision, "total_steps": STEPS}
-    return sweep.main(
-        [
-            *("--env", "rover", "--disturbances", DISTURBANCE, "--algorithms", AGENT),
-            *("--history-lengths", str(HISTORY_LENGTH), "--seeds", str(SEEDS)),
-            *("--out", str(run), *flags(settings), *more),
-        ]
-    )
+def train(run: pathlib.Path, precision: str, seeds: range, tiny: dict[str, object]) -> list[str]:
+    """Train what is missing; a line for each lane that was lost."""
+    settings = {**ROVER_SETTINGS, "precision": precision, "total_steps": ROVER_STEPS, **tiny}
+    config = rtd.Config(AGENT, ROVER_HISTORY_LENGTH, **settings)
+    study = rtd.Study([rtd.Cell("rover", DISTURBANCE, config)], seeds=seeds, out=run)
+    return study.run(quiet=bool(tiny), page=not tiny)
 
 
 def evaluate(run: pathlib.Path, seeds: range, episodes: int) -> list[float]:
@@ -65,17 +60,18 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--float32", type=pathlib.Path, help="a run of experiments/rover.py")
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS / "benchmarks")
     options = parser.parse_args(arguments)
-    more, seeds, episodes = [], range(SEEDS), EPISODES
+    tiny: dict[str, object] = {}
+    seeds, episodes = range(SEEDS), EPISODES
     if options.quick:
-        more = ["--total-steps=40", "--hidden-size=4", "--batch-size=4", "--learning-starts=10"]
-        more += ["--eval-every=40", "--eval-episodes=1", "--final-episodes=1", "--seeds=2"]
-        more += ["--quiet", "--no-report"]
+        tiny = {"total_steps": 40, "hidden_size": 4, "batch_size": 4, "learning_starts": 10}
+        tiny |= {"eval_every": 40, "eval_episodes": 1}
         seeds, episodes = range(2), 2
     runs = {"float32": options.float32 or options.run / "float32"}
     runs["bfloat16"] = options.run / "bfloat16"
     for precision, run in runs.items():
-        if run != options.float32 and (status := train(run, precision, more)):
-            return status
+        if run != options.float32 and (lost := train(run, precision, seeds, tiny)):
+            print(*lost, sep="\n", file=sys.stderr)
+            return 1
     table = pd.DataFrame(
         {"seed": list(seeds), **{p: evaluate(run, seeds, episodes) for p, run in runs.items()}}
     )

@@ -92,7 +92,7 @@ def tested(run: pathlib.Path, trained_on: str, episodes: int) -> pd.DataFrame:
     lane = ["algorithm", "history_length", "trained_on", "tested_on", "seed"]
     lanes = returns.groupby(lane, as_index=False)["true_return"].mean()
     lanes["normalised"] = normalised(lanes, "tested_on")
-    configs = {(c.config.algorithm, c.config.tokens): c.config for c in directory.cells}
+    configs = {(c.config.algorithm, c.config.window_tokens): c.config for c in directory.cells}
     own = [configs[key] for key in zip(lanes["algorithm"], lanes["history_length"], strict=True)]
     return lanes.assign(
         episodes=episodes,

@@ -70,7 +70,7 @@ def missing(wanted: list[rtd.Cell], lanes: pd.DataFrame, seeds: int) -> list[rtd
         config = cell.config
         own = lanes[
             (lanes["algorithm"] == config.algorithm)
-            & (lanes["history_length"] == config.tokens)
+            & (lanes["history_length"] == config.window_tokens)
             & (lanes["disturbance"] == cell.disturbance)
             & (lanes["setting"] == current_setting(config.algorithm))
             & (lanes["steps"] == config.total_steps)

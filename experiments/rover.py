@@ -23,7 +23,8 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 import rtd3jax as rtd
-from rtd3jax import sweep
+from rtd3jax.study.plan import make_cells
+from rtd3jax.study.presets import PRESETS
 from rtd3jax.study.presets import ROVER_HISTORY_LENGTH as HISTORY_LENGTH
 from rtd3jax.study.presets import ROVER_SETTINGS as SETTINGS
 from rtd3jax.study.presets import ROVER_STEPS as STEPS
@@ -67,14 +68,14 @@ PAPER = {
 """Mean ± standard deviation over five seeds (Omi et al., the rover's two tables)."""
 
 
-def train(run: pathlib.Path, steps: int, more: list[str]) -> int:
-    """Train what is missing; the sweep's exit status."""
-    return sweep.main(
-        [
-            *("--preset", "rover", "--seeds", str(SEEDS), "--total-steps", str(steps)),
-            *("--out", str(run), *more),
-        ]
-    )
+def train(run: pathlib.Path, steps: int, tiny: dict[str, object]) -> list[str]:
+    """Train what is missing; a line for each lane that was lost."""
+    cells = make_cells(PRESETS["rover"], {"total_steps": steps, **tiny})
+    if tiny:
+        cells = cells[:1]
+    seeds = range(1 if tiny else SEEDS)
+    study = rtd.Study(cells, seeds=seeds, out=run, final_episodes=1 if tiny else PAPER_EPISODES)
+    return study.run(quiet=bool(tiny), page=not tiny)
 
 
 def evaluate_policies(run: pathlib.Path, episodes: int, known: pd.DataFrame | None, setting: str):
@@ -219,16 +220,15 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--steps", type=int, default=STEPS)
     parser.add_argument("--report", action="store_true", help="evaluate what there is; no training")
     options = parser.parse_args(arguments)
-    began, more, steps, episodes = time.time(), [], options.steps, EPISODES
+    began, steps, episodes = time.time(), options.steps, EPISODES
+    tiny: dict[str, object] = {}
     if options.quick:
         steps, episodes = 60, PAPER_EPISODES
-        more = ["--hidden-size=4", "--batch-size=4", "--learning-starts=10", "--eval-every=60"]
-        more += ["--eval-episodes=1", "--final-episodes=1", "--quiet", "--algorithms", "td3"]
-        more += ["--disturbances", "ar1-slip"]
-        more += ["--seeds", "1", "--no-report"]
-    status = 0 if options.report else train(options.run, steps, more)
-    if status not in (0, 1):
-        return status
+        tiny = {"hidden_size": 4, "batch_size": 4, "learning_starts": 10}
+        tiny |= {"eval_every": 60, "eval_episodes": 1}
+    if not options.report:
+        for line in train(options.run, steps, tiny):
+            print(line, file=sys.stderr)
     kept = options.out / "rover.parquet"
     known = pd.read_parquet(kept) if options.report and kept.exists() else None
     setting = setting_text({**SETTINGS, "total_steps": steps})

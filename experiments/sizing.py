@@ -2,8 +2,8 @@
 
 Usage: python experiments/sizing.py [--quick] [--out DIR]
 
-Bytes are those of the memory plan (`rtd3jax.study.memory`), seed-steps per second those that the
-benchmark measured on its machine (results/benchmarks/measurements.csv). Writes sizing.md and
+Bytes are those of the memory plan (`rtd3jax.study.memory_plan`), seed-steps per second those that
+the benchmark measured on its machine (results/benchmarks/measurements.csv). Writes sizing.md and
 .parquet.
 """
 
@@ -13,7 +13,7 @@ import sys
 
 import pandas as pd
 
-from rtd3jax.study.memory import job_bytes, lanes_at_once
+from rtd3jax.study.memory_plan import job_bytes, lanes_at_once
 from rtd3jax.study.plan import Grid, cell_jobs, make_cells
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))

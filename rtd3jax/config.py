@@ -179,7 +179,7 @@ class Config:
             )
         if self.replay == "segments":
             self._check_segments()
-        window = 1 + self.tokens
+        window = 1 + self.window_tokens
         if capacity < max(self.batch_size, window):
             raise UserError(
                 f"replay_capacity ({capacity}) holds less than a batch "
@@ -271,7 +271,7 @@ class Config:
         return AGENTS[self.algorithm].has_window
 
     @property
-    def tokens(self) -> int:
+    def window_tokens(self) -> int:
         """Past tokens in a window: l, and 0 for an agent without one."""
         assert self.history_length is not None  # resolved when it was made
         return self.history_length

@@ -25,10 +25,11 @@ from rtd3jax.study.finish import finish
 from rtd3jax.study.hosts import own_shard, own_share, relaunch
 from rtd3jax.study.lock import parse_shard, writer
 from rtd3jax.study.loggers import check_loggers, open_loggers
-from rtd3jax.study.memory import lanes_at_once, memory
+from rtd3jax.study.memory_plan import lanes_at_once, usable_memory
 from rtd3jax.study.plan import make_cells, plan_text
 from rtd3jax.study.references import references_of
 from rtd3jax.study.rundir import RunDirectory
+from rtd3jax.study.status import ledger
 from rtd3jax.training.lanes import Job, workers
 from rtd3jax.training.run import check_strategy
 
@@ -91,12 +92,12 @@ def _run(options: argparse.Namespace) -> int:
     jobs = directory.jobs(strategy)
     if options.dry_run:
         say = functools.partial(print, file=sys.stderr, flush=True)
-        print(plan_text(directory.cells, directory.seeds, jobs, strategy, memory(), say))
+        print(plan_text(directory.cells, directory.seeds, jobs, strategy, usable_memory(), say))
         print(news, end="\n" if news else "")
         return 0
     # On a cluster its nodes, not this machine, must have the memory.
     fit = len(jobs) if options.cluster else None
-    at_once = fit or lanes_at_once(jobs, strategy, len(workers()), memory())
+    at_once = fit or lanes_at_once(jobs, strategy, len(workers()), usable_memory())
     interval = given.parse_interval(options.checkpoint_every)
     shard = _shard(options)
     if options.fresh:
@@ -173,14 +174,14 @@ def _set_aside(out: Path) -> None:
 
 def _status(out: Path) -> int:
     directory = RunDirectory.open(out)
-    ledger = directory.ledger()
-    for row in ledger:
+    lanes = ledger(directory)
+    for row in lanes:
         length = f"l={row['history_length']}"
         print(
             f"{row['env']:10} {row['disturbance']:24} {row['algorithm']:20} {length:5} "
             f"seed {row['seed']:<4} {row['status']:9} {row['step']:>10,}  {row['reason']}"
         )
-    counts = collections.Counter(row["status"] for row in ledger)
+    counts = collections.Counter(row["status"] for row in lanes)
     print(", ".join(f"{count} {status}" for status, count in counts.items()))
     return 1 if counts["failed"] or counts["lost"] else 0
 

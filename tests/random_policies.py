@@ -46,7 +46,8 @@ def random_policy(
         history_length=jnp.int32(length),
         centre_token=jnp.zeros(interface.action_size),
         algorithm=algorithm,
-        tokens=length + 2 * bool(length),  # as where lanes of several lengths share a program
+        window_tokens=length
+        + 2 * bool(length),  # as where lanes of several lengths share a program
         observation_size=interface.observation_size,
         action_shape=interface.action_shape,
         memory=memory,

@@ -116,6 +116,25 @@ def test_the_checks_can_fail():
     assert circle(graph) == ["rtd3jax.study.hosts", "rtd3jax.study.launch", "rtd3jax.sweep"]
 
 
+def reached(graph, module):
+    """All that the module imports, and what that imports in turn."""
+    found, todo = set(), [module]
+    while todo:
+        new = graph.get(todo.pop(), set()) - found
+        found |= new
+        todo += new
+    return found
+
+
+def test_to_load_a_policy_draws_on_no_pictures_or_page():
+    """gymnax imports matplotlib; a run directory that is opened for a policy asks for no more."""
+    needed = reached(GRAPH, "rtd3jax.policies.load")
+    assert "rtd3jax.study.lane_files" in needed
+    drawing = {"rtd3jax.study.figures", "rtd3jax.study.derive", "rtd3jax.study.report.page"}
+    assert not needed & drawing
+    assert "rtd3jax.study.figures" in reached(GRAPH, "rtd3jax.study.finish")
+
+
 def untyped(found):
     """How many parameters functions have, and those that are typed ``Any``."""
     count, vague = 0, []

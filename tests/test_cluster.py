@@ -15,8 +15,9 @@ from rtd3jax import sweep
 from rtd3jax.errors import UserError
 from rtd3jax.study import cluster, hosts
 from rtd3jax.study.execute import Work
+from rtd3jax.study.log import LOG
 from rtd3jax.study.plan import Grid, cell_jobs, make_cells
-from rtd3jax.study.rundir import LOG, RunDirectory
+from rtd3jax.study.rundir import RunDirectory
 
 STUDY = [
     *("--env", "rover", "--disturbances", "ar1-slip", "--algorithms", "td3"),

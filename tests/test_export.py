@@ -29,9 +29,11 @@ def run(tmp_path_factory):
     """A run directory: seed 0 of every cell is trained, seed 1 of the first was lost."""
     directory = RunDirectory(tmp_path_factory.mktemp("run"), CELLS, [0, 1, 2], 1)
     for cell in CELLS:
-        actor = random_policy(cell.config.algorithm, cell.make_env(), length=3).actor
-        directory.write_lane(cell, 0, actor, CURVES, {}, None)
-    directory.write_lane(CELLS[0], 1, {}, CURVES, {}, {"step": 7, "reason": "loss is not finite"})
+        policy = random_policy(cell.config.algorithm, cell.make_env(), length=3)
+        directory.lanes.write_lane(cell, 0, policy.parameters(), CURVES, {}, None)
+    directory.lanes.write_lane(
+        CELLS[0], 1, {}, CURVES, {}, {"step": 7, "reason": "loss is not finite"}
+    )
     return directory.path
 
 
@@ -40,7 +42,7 @@ def test_a_lane_of_a_run_directory_becomes_a_policy(run):
     expected = random_policy("lstm-td3", rtd.make("rover", "ar1-slip"))
     jax.tree.map(np.testing.assert_array_equal, policy.actor, expected.actor)
     jax.tree.map(np.testing.assert_array_equal, policy.bounds, expected.bounds)
-    assert policy.history_length == 3 and policy.tokens == 3
+    assert policy.history_length == 3 and policy.window_tokens == 3
     hidden = rtd.load_policy(run, env="pendulum")
     assert hidden.observation_size == 2 and hidden.bounds.high.tolist() == [2.0]
 
@@ -69,7 +71,7 @@ def test_what_cannot_be_chosen_is_named(run, which, message):
 def test_a_lane_for_another_observation_is_refused(tmp_path):
     directory = RunDirectory(tmp_path / "run", [_cell("pendulum", "random-sine")], [0], 1)
     other = random_policy("h-td3", rtd.make("pendulum", "hidden"))
-    directory.write_lane(directory.cells[0], 0, other.actor, CURVES, {}, None)
+    directory.lanes.write_lane(directory.cells[0], 0, other.parameters(), CURVES, {}, None)
     with pytest.raises(rtd.UserError, match="does not fit h-td3 with 3 observation elements"):
         rtd.load_policy(tmp_path / "run")
 
@@ -87,8 +89,10 @@ def test_a_lane_of_a_world_that_is_not_registered_is_loaded_and_exported(tmp_pat
     cell = _cell("robot", "dropout")
     policy = random_policy("h-td3", cell.make_env())
     directory = RunDirectory(tmp_path / "run", [cell], [0, 1], 1)
-    directory.write_lane(cell, 0, policy.actor, CURVES, {}, None, policy.interface())
-    directory.write_lane(cell, 1, policy.actor, CURVES, {}, None)  # as older versions did
+    directory.lanes.write_lane(cell, 0, policy.parameters(), CURVES, {}, None, policy.interface())
+    directory.lanes.write_lane(
+        cell, 1, policy.parameters(), CURVES, {}, None
+    )  # as older versions did
     old = rtd.load_policy(tmp_path / "run", seed=1)
     monkeypatch.setattr(registry, "_entries", known)
     loaded = rtd.load_policy(tmp_path / "run")
@@ -100,7 +104,9 @@ def test_a_lane_of_a_world_that_is_not_registered_is_loaded_and_exported(tmp_pat
     assert out.exists()
     with pytest.raises(rtd.UserError, match="unknown environment 'robot'"):
         rtd.load_policy(tmp_path / "run", seed=1)
-    directory.write_lane(cell, 0, policy.actor, CURVES, {}, None, {"observation_size": 0})
+    directory.lanes.write_lane(
+        cell, 0, policy.parameters(), CURVES, {}, None, {"observation_size": 0}
+    )
     with pytest.raises(rtd.UserError, match="damaged: its header's observation_size is 0"):
         rtd.load_policy(tmp_path / "run")
 

@@ -14,6 +14,7 @@ import pandas as pd
 import pytest
 
 import rtd3jax as rtd
+from rtd3jax.study.derive import derive
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.system.files import read_arrays
 
@@ -76,7 +77,7 @@ def test_a_run_directory_gives_the_same_tables_and_policies(tmp_path):
     for table in ("curves", "episodes"):
         (path / f"{table}.parquet").unlink()
     directory = RunDirectory.open(path)
-    directory.derive([], pictures=False)
+    derive(directory, [], pictures=False)
     for table in ("curves", "episodes"):
         expected = pd.read_parquet(GOLDEN / "run" / f"{table}.parquet")
         expected = expected[expected["seed"] >= 0].reset_index(drop=True)

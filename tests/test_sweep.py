@@ -134,7 +134,9 @@ def test_a_directory_that_is_no_study_is_left_alone(tmp_path, capsys):
 
 
 def test_dry_run_prints_the_plan(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(pace, "group_seconds", lambda jobs: 60.0 * (1 + jobs[0].program.tokens))
+    monkeypatch.setattr(
+        pace, "group_seconds", lambda jobs: 60.0 * (1 + jobs[0].program.window_tokens)
+    )
     monkeypatch.setattr(pace, "workers", lambda: [None, None])
     assert sweep.main(["--preset", "rover", "--dry-run", "--out", str(tmp_path / "run")]) == 0
     plan, said = capsys.readouterr()
@@ -245,7 +247,7 @@ def test_a_cell_that_raises_does_not_stop_the_others(tmp_path, monkeypatch, caps
     real = lanes._chunk
 
     def chunk(group, *rest):
-        cell, seed = group.jobs[0].owner
+        cell, seed = group.jobs[0].key
         if cell.config.algorithm == "td3" and seed == 1:
             raise RuntimeError("the plant is on fire\nand more")
         real(group, *rest)

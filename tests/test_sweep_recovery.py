@@ -14,7 +14,8 @@ import pytest
 
 from rtd3jax import sweep
 from rtd3jax.study import finish, recorder, references
-from rtd3jax.study.rundir import LOG, RunDirectory, read_log
+from rtd3jax.study.log import LOG, read_log
+from rtd3jax.study.rundir import RunDirectory
 
 STUDY = [
     *("--env", "rover", "--disturbances", "ar1-slip", "--algorithms", "td3", "h-td3"),

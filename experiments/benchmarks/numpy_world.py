@@ -86,22 +86,24 @@ class Ring:
         if width is not None:
             self._carries = np.zeros((capacity + 1, 2, width), np.float32)
 
-    def put(self, previous_action, observation, action, reward, after, terminated, age) -> None:
+    def put(
+        self, previous_action, observation, action, reward, after, terminated, episode_step
+    ) -> None:
         """Write the next row."""
         slot = self.count % self._capacity
         self._tokens[slot] = (*previous_action, *observation, *action)
-        self._outcomes[slot] = (*after, reward, terminated, age)
+        self._outcomes[slot] = (*after, reward, terminated, episode_step)
         self.count += 1
 
     def put_carry(self, number: int, carry: np.ndarray) -> None:
         """The behaviour actor's carry [2, H] before step ``number``."""
         self._carries[number % (self._capacity + 1)] = carry
 
-    def past(self, number: np.ndarray, age: np.ndarray, length: int) -> tuple:
+    def past(self, number: np.ndarray, episode_step: np.ndarray, length: int) -> tuple:
         """Tokens [L, B, W] before the steps ``number`` [B], and how many of them exist [B]."""
         offsets = np.arange(-length, 0)[:, None]
         oldest = max(self.count - self._capacity, 0)
-        exist = np.minimum(np.minimum(age, number - oldest), length)
+        exist = np.minimum(np.minimum(episode_step, number - oldest), length)
         return self._tokens.take((number + offsets) % self._capacity, axis=0), exist
 
     def sample(self, random: np.random.Generator, batch: int, length: int) -> Batch:
@@ -114,15 +116,15 @@ class Ring:
         slot = number % self._capacity
         outcomes = self._outcomes.take(slot, axis=0)
         split = self._observation_size
-        age = outcomes[:, split + 2].astype(np.int64)
-        past, exist = self.past(number, age, length)
+        episode_step = outcomes[:, split + 2].astype(np.int64)
+        past, exist = self.past(number, episode_step, length)
         current = self._tokens.take(slot, axis=0)
         tokens = np.concatenate((past, current[None]))
         action = current[:, self._split :]
         carry = next_carry = None
         if self._carries is not None:
             carry = self._carries.take(number % (self._capacity + 1), axis=0)
-            carry[age == 0] = 0.0
+            carry[episode_step == 0] = 0.0
             next_carry = self._carries.take((number + 1) % (self._capacity + 1), axis=0)
         return Batch(
             window=Window(past, missing(exist, length), current[:, : self._split]),

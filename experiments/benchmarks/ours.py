@@ -104,8 +104,8 @@ class Lanes:
                 ),
                 state.replay,
             )
-            age = jnp.arange(rows.transitions.age.shape[0], dtype=jnp.int32) % 200
-            rows = rows.replace(transitions=rows.transitions.replace(age=age))
+            episode_step = jnp.arange(rows.transitions.episode_step.shape[0], dtype=jnp.int32) % 200
+            rows = rows.replace(transitions=rows.transitions.replace(episode_step=episode_step))
             group.state, group.step = state.replace(replay=rows), steps
 
     @property

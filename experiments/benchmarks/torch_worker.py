@@ -69,7 +69,7 @@ class Seed:
     def _begin(self) -> None:
         self._observation = self._world.reset()
         self._previous = np.zeros(ACTION_SIZE, np.float32)
-        self._age = 0
+        self._episode_step = 0
 
     def step(self) -> None:
         """One environment step and its updates."""
@@ -78,32 +78,42 @@ class Seed:
         carry = None
         if self._keeps_carry:
             carry = self._carry_before(window)
-            if self._age:
+            if self._episode_step:
                 self._ring.put_carry(number, carry)
         action = self._act(window, carry, number)
         if number >= self._starts:
             self._learn(number - self._starts + 1)
         observation, reward, done = self._world.step(action)
         self._ring.put(
-            self._previous, self._observation, action, reward, observation, False, self._age
+            self._previous,
+            self._observation,
+            action,
+            reward,
+            observation,
+            False,
+            self._episode_step,
         )
         if done and self._keeps_carry:
             after = self._next_window(window, action, observation)
             self._ring.put_carry(number + 1, self._carry_before(after))
-        self._observation, self._previous, self._age = observation, action, self._age + 1
+        self._observation, self._previous, self._episode_step = (
+            observation,
+            action,
+            self._episode_step + 1,
+        )
         if done:
             self._begin()
 
     def _window(self) -> Window:
-        number, age = np.array([self._ring.count]), np.array([self._age])
-        past, exist = self._ring.past(number, age, self._length)
+        number, episode_step = np.array([self._ring.count]), np.array([self._episode_step])
+        past, exist = self._ring.past(number, episode_step, self._length)
         current = np.concatenate((self._previous, self._observation))[None]
         return Window(past, missing(exist, self._length), current)
 
     def _next_window(self, window: Window, action, observation) -> Window:
         token = np.concatenate((window.current[0], action))[None, None]
         past = np.concatenate((window.past, token))[1:]
-        exist = np.array([min(self._age + 1, self._length)])
+        exist = np.array([min(self._episode_step + 1, self._length)])
         current = np.concatenate((action, observation))[None]
         return Window(past, missing(exist, self._length), current)
 

@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 
 import rtd3jax as rtd
 from rtd3jax import sweep
-from rtd3jax.study import finish, references, rundir
+from rtd3jax.study import derive, finish, references
 
 FIELDS = [field.name for field in dataclasses.fields(rtd.Config)]
 VALUES = st.one_of(
@@ -150,8 +150,8 @@ def main(arguments: list[str] | None = None) -> int:
         tempfile.TemporaryDirectory() as root,
         warnings.catch_warnings(),
         mock.patch.object(references, "EPISODES", 1),
-        mock.patch.object(rundir, "learning_curves"),  # pictures take seconds each
-        mock.patch.object(rundir, "final_returns"),
+        mock.patch.object(derive, "learning_curves"),  # pictures take seconds each
+        mock.patch.object(derive, "final_returns"),
         mock.patch.object(finish, "refresh_page"),
     ):
         warnings.simplefilter("ignore")

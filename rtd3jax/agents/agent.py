@@ -77,7 +77,7 @@ class Agent:
     @property
     def acting_tokens(self) -> int:
         """Past tokens in the arrays of the window that it acts upon."""
-        return 0 if self.has_running_carry else self.config.tokens
+        return 0 if self.has_running_carry else self.config.window_tokens
 
     def init(self, key: jax.Array) -> Any:
         """The learner's state at the start; its ``actor`` is the actor's parameters."""
@@ -164,14 +164,14 @@ class Agent:
         self, replay: Replay, key: jax.Array, count: jax.Array, history_length: jax.Array
     ) -> Batch:
         config = self.config
-        rows = replay, key, count, config.batch_size, config.tokens, history_length
+        rows = replay, key, count, config.batch_size, config.window_tokens, history_length
         if config.replay == "segments":
-            readers = {(True, False): "critic", (False, True): "actor", (True, True): "both"}
             return sample_segments(
                 *rows,
                 config.segment_steps,
                 config.burn_in_gradient,
-                carries_for=readers.get((self.variant.stores_carry, config.runs_on), "none"),
+                critic_reads_carries=self.variant.stores_carry,
+                actor_goes_on=config.runs_on,
             )
         return sample(*rows)
 
@@ -180,11 +180,11 @@ class Agent:
         state: Any,
         batch: Batch,
         keys: jax.Array,
-        numbers: Hyperparameters,
+        hyperparameters: Hyperparameters,
         count: jax.Array,
     ) -> tuple[Any, Metrics]:
         """The ``count``-th update (int32 [], from 1); ``keys`` [2] are consumed here."""
-        return self.learner.update(self.networks, state, batch, keys, numbers, count)
+        return self.learner.update(self.networks, state, batch, keys, hyperparameters, count)
 
 
 def make_agent(config: Config, interface: Sizes) -> Agent:

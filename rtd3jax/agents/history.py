@@ -134,49 +134,51 @@ def put_row(ring: jax.Array, slot: jax.Array, row: jax.Array) -> jax.Array:
     return jax.lax.dynamic_update_index_in_dim(ring, row.astype(ring.dtype), slot, axis=0)
 
 
-def put_step(ring: Steps, number: jax.Array, step: Steps) -> Steps:
-    """The ring after step ``number`` (int32 []), whose leaves are [O] and [A]."""
-    slot = number % ring.action.shape[0]
+def put_step(ring: Steps, step_number: jax.Array, step: Steps) -> Steps:
+    """The ring after step ``step_number`` (int32 []), whose leaves are [O] and [A]."""
+    slot = step_number % ring.action.shape[0]
     return jax.tree.map(lambda kept, row: put_row(kept, slot, row), ring, step)
 
 
 def window_at(
     ring: Steps,
-    number: jax.Array,
-    age: jax.Array,
+    step_number: jax.Array,
+    episode_step: jax.Array,
     count: jax.Array,
-    tokens: int,
+    window_tokens: int,
     history_length: jax.Array | int,
     observation: jax.Array,
     previous_action: jax.Array,
 ) -> Window:
-    """What may be read at step ``number``.
+    """What may be read at step ``step_number``.
 
     Args:
         ring: the steps.
-        number: int32 [B], at most ``count``.
-        age: int32 [B], steps of the same episode before it.
+        step_number: int32 [B], at most ``count``.
+        episode_step: int32 [B], steps of the same episode before it.
         count: int32 [], steps ever written; the ring holds the last C of them.
-        tokens: L, past tokens in the window's arrays.
+        window_tokens: L, past tokens in the window's arrays.
         history_length: l <= L, past tokens that may be read.
         observation: [B, O], of the step.
         previous_action: [B, A], before it.
     """
     capacity = ring.action.shape[0]
-    offset = jnp.arange(tokens, 0, -1, dtype=jnp.int32)
-    slots = (number[None, :] - offset[:, None]) % capacity
+    offset = jnp.arange(window_tokens, 0, -1, dtype=jnp.int32)
+    slots = (step_number[None, :] - offset[:, None]) % capacity
     past = jax.tree.map(lambda kept: kept[slots], ring)
     oldest = jnp.maximum(count - capacity, 0)
-    length = _limited(jnp.minimum(age, number - oldest), tokens, history_length)
+    length = _limited(
+        jnp.minimum(episode_step, step_number - oldest), window_tokens, history_length
+    )
     return Window(past, length, observation, previous_action)
 
 
 def segment_at(
     ring: Steps,
-    ages: jax.Array,
+    episode_steps: jax.Array,
     first: jax.Array,
     count: jax.Array,
-    tokens: int,
+    window_tokens: int,
     length: int,
     history_length: jax.Array | int,
     burn_in_gradient: bool,
@@ -185,32 +187,34 @@ def segment_at(
 
     Args:
         ring: the steps.
-        ages: int32 [C], steps of the same episode before each.
+        episode_steps: int32 [C], steps of the same episode before each.
         first: int32 [M], such that the last of the m steps is below ``count``.
         count: int32 [], steps ever written; the ring holds the last C of them.
-        tokens: L, tokens of the burn-in.
+        window_tokens: L, tokens of the burn-in.
         length: m.
         history_length: l <= L, tokens of the burn-in that may be read.
         burn_in_gradient: see `Segment`.
     """
-    capacity = ages.shape[0]
-    offset = jnp.arange(-tokens, length, dtype=jnp.int32)
-    number = first[None, :] + offset[:, None]
-    slots = number % capacity
+    capacity = episode_steps.shape[0]
+    offset = jnp.arange(-window_tokens, length, dtype=jnp.int32)
+    step_number = first[None, :] + offset[:, None]
+    slots = step_number % capacity
     oldest = jnp.maximum(count - capacity, 0)
-    starts = (ages[slots] == 0) | (number == oldest) | (offset == -history_length)[:, None]
+    starts = (
+        (episode_steps[slots] == 0) | (step_number == oldest) | (offset == -history_length)[:, None]
+    )
     steps = jax.tree.map(lambda kept: kept[slots], ring)
     segment = Segment(
         steps=steps,
         starts=starts,
-        observation=flat(steps.observation[tokens:]),
-        previous_action=flat(steps.previous_action[tokens:]),
-        begins=ages[slots[0]] == 0,
+        observation=flat(steps.observation[window_tokens:]),
+        previous_action=flat(steps.previous_action[window_tokens:]),
+        begins=episode_steps[slots[0]] == 0,
         start=None,
         following=False,
         burn_in_gradient=burn_in_gradient,
     )
-    return segment, slots[tokens:]
+    return segment, slots[window_tokens:]
 
 
 def next_window(
@@ -225,16 +229,16 @@ def next_window(
         history_length: l, the most past tokens that may be read.
     """
     current = Steps(window.observation, window.previous_action, action)
-    tokens = window.past.action.shape[0]
+    window_tokens = window.past.action.shape[0]
     past = jax.tree.map(
-        lambda old, new: jnp.concatenate((old, new[None]))[1:] if tokens else old,
+        lambda old, new: jnp.concatenate((old, new[None]))[1:] if window_tokens else old,
         window.past,
         current,
     )
-    length = _limited(window.length + 1, tokens, history_length)
+    length = _limited(window.length + 1, window_tokens, history_length)
     return Window(past, length, next_observation, action)
 
 
-def _limited(length: jax.Array, tokens: int, history_length: jax.Array | int) -> jax.Array:
+def _limited(length: jax.Array, window_tokens: int, history_length: jax.Array | int) -> jax.Array:
     """``length`` int32 [B], as far as the window's arrays and the agent's own length allow."""
-    return jnp.minimum(jnp.minimum(length, tokens), history_length).astype(jnp.int32)
+    return jnp.minimum(jnp.minimum(length, window_tokens), history_length).astype(jnp.int32)

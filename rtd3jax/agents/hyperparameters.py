@@ -22,7 +22,7 @@ class Hyperparameters:
     actor_noise: jax.Array
     history_length: jax.Array
 
-    def at(self, progress: jax.Array) -> "Hyperparameters":
+    def decayed(self, progress: jax.Array) -> "Hyperparameters":
         """These numbers when the share ``progress`` [] of all steps is done: the rates decay."""
         scale = 1.0 - (1.0 - self.final_learning_rate_fraction) * progress
         return dataclasses.replace(

@@ -39,14 +39,14 @@ class Transition:
         next_observation: [O]; at an episode's end the final observation, never the next episode's
             first.
         terminated: bool []; stops bootstrapping. A time limit is not a termination.
-        age: int32 [], steps of the same episode before this one; bounds the window.
+        episode_step: int32 [], steps of the same episode before this one; bounds the window.
     """
 
     step: Steps
     reward: jax.Array
     next_observation: jax.Array
     terminated: jax.Array
-    age: jax.Array
+    episode_step: jax.Array
 
 
 @struct.dataclass
@@ -96,7 +96,7 @@ def empty_replay(
         reward=jnp.zeros((capacity,), jnp.float32),
         next_observation=jnp.zeros((capacity, observation_size), jnp.float32),
         terminated=jnp.zeros((capacity,), bool),
-        age=jnp.zeros((capacity,), jnp.int32),
+        episode_step=jnp.zeros((capacity,), jnp.int32),
     )
     carries = jax.tree.map(
         lambda leaf: jnp.zeros((capacity + 1, *leaf.shape[1:]), jnp.float32), carry
@@ -107,10 +107,10 @@ def empty_replay(
 def present_window(
     replay: Replay,
     step: jax.Array,
-    age: jax.Array,
+    episode_step: jax.Array,
     observation: jax.Array,
     previous_action: jax.Array,
-    tokens: int,
+    window_tokens: int,
     history_length: jax.Array | int,
 ) -> Window:
     """The window of step ``step`` (int32 []), which is not written yet: a batch of one.
@@ -118,49 +118,49 @@ def present_window(
     Args:
         replay: the ring, with all steps before.
         step: the step's number.
-        age: int32 [], steps of the same episode before it.
+        episode_step: int32 [], steps of the same episode before it.
         observation: [O], seen at it.
         previous_action: [A], before it.
-        tokens: L, past tokens in the window's arrays.
+        window_tokens: L, past tokens in the window's arrays.
         history_length: l <= L, past tokens that may be read.
     """
     return window_at(
         replay.transitions.step,
         step[None],
-        age[None],
+        episode_step[None],
         step,
-        tokens,
+        window_tokens,
         history_length,
         observation[None],
         previous_action[None],
     )
 
 
-def put_transition(replay: Replay, number: jax.Array, row: Transition) -> Replay:
-    """The ring after step ``number`` (int32 [])."""
+def put_transition(replay: Replay, step_number: jax.Array, row: Transition) -> Replay:
+    """The ring after step ``step_number`` (int32 [])."""
     kept = replay.transitions
-    slot = number % kept.reward.shape[0]
+    slot = step_number % kept.reward.shape[0]
     return dataclasses.replace(
         replay,
         transitions=Transition(
-            step=put_step(kept.step, number, row.step),
+            step=put_step(kept.step, step_number, row.step),
             reward=put_row(kept.reward, slot, row.reward),
             next_observation=put_row(kept.next_observation, slot, row.next_observation),
             terminated=put_row(kept.terminated, slot, row.terminated),
-            age=put_row(kept.age, slot, row.age),
+            episode_step=put_row(kept.episode_step, slot, row.episode_step),
         ),
     )
 
 
-def put_carry(replay: Replay, number: jax.Array, carry: Carry) -> Replay:
-    """The ring with the behaviour actor's carry (leaves [...]) before step ``number``."""
-    slot = _carry_slot(replay.carries, number)
+def put_carry(replay: Replay, step_number: jax.Array, carry: Carry) -> Replay:
+    """The ring with the behaviour actor's carry (leaves [...]) before step ``step_number``."""
+    slot = _carry_slot(replay.carries, step_number)
     carries = jax.tree.map(lambda kept, row: put_row(kept, slot, row), replay.carries, carry)
     return dataclasses.replace(replay, carries=carries)
 
 
 def keep_acting_carry(
-    replay: Replay, step: jax.Array, age: jax.Array, carry: Carry | None
+    replay: Replay, step: jax.Array, episode_step: jax.Array, carry: Carry | None
 ) -> Replay:
     """Keep the carry (leaves [1, ...]) with which step ``step`` acts; before it is learned from.
 
@@ -170,7 +170,7 @@ def keep_acting_carry(
         return replay
     slot = _carry_slot(replay.carries, step)
     row = jax.tree.map(
-        lambda kept, new: jnp.where(age == 0, kept[slot], new[0]), replay.carries, carry
+        lambda kept, new: jnp.where(episode_step == 0, kept[slot], new[0]), replay.carries, carry
     )
     return put_carry(replay, step, row)
 
@@ -210,21 +210,21 @@ def store(
 
 
 @jax.custom_batching.custom_vmap
-def _after(number: jax.Array, never: jax.Array) -> jax.Array:
-    """``number``, but known only when ``never`` (always false) is.
+def _after(step_number: jax.Array, never: jax.Array) -> jax.Array:
+    """``step_number``, but known only when ``never`` (always false) is.
 
     A row that is written by it is written after what ``never`` was computed from has read the
     ring. Where XLA sees no such order, it copies the whole ring at every step to be safe; an
     optimization barrier does not tell it, since that is removed before copies are decided upon.
     """
-    return number + never.astype(number.dtype)
+    return step_number + never.astype(step_number.dtype)
 
 
 @_after.def_vmap
-def _after_of_lanes(axis_size, batched, number, never):
+def _after_of_lanes(axis_size, batched, step_number, never):
     # One number for all lanes, lest the write become a scatter.
     assert not batched[0]
-    return _after(number, jnp.any(never)), False
+    return _after(step_number, jnp.any(never)), False
 
 
 def sample(
@@ -232,7 +232,7 @@ def sample(
     key: jax.Array,
     count: jax.Array,
     batch_size: int,
-    tokens: int,
+    window_tokens: int,
     history_length: jax.Array | int,
 ) -> Batch:
     """Uniform draws, with replacement, from the rows kept; the cost does not depend on C.
@@ -242,38 +242,38 @@ def sample(
         key: consumed here.
         count: int32 [], steps written so far, at least 1.
         batch_size: B.
-        tokens: L, past tokens in a window.
+        window_tokens: L, past tokens in a window.
         history_length: l <= L, past tokens that may be read.
     """
     capacity = replay.transitions.reward.shape[0]
     oldest = jnp.maximum(count - capacity, 0)
-    number = jax.random.randint(key, (batch_size,), oldest, count, jnp.int32)
-    return gather(replay, number, count, tokens, history_length)
+    step_number = jax.random.randint(key, (batch_size,), oldest, count, jnp.int32)
+    return gather(replay, step_number, count, window_tokens, history_length)
 
 
 def gather(
     replay: Replay,
-    number: jax.Array,
+    step_number: jax.Array,
     count: jax.Array,
-    tokens: int,
+    window_tokens: int,
     history_length: jax.Array | int,
 ) -> Batch:
     """The batch of the rows with these numbers (int32 [B], all of them kept); see `sample`."""
     kept = replay.transitions
-    slot = number % kept.reward.shape[0]
-    age = kept.age[slot]
+    slot = step_number % kept.reward.shape[0]
+    episode_step = kept.episode_step[slot]
     window = window_at(
         kept.step,
-        number,
-        age,
+        step_number,
+        episode_step,
         count,
-        tokens,
+        window_tokens,
         history_length,
         kept.step.observation[slot],
         kept.step.previous_action[slot],
     )
     action = kept.step.action[slot]
-    carry, next_carry = _stored_carries(replay, number, age)
+    carry, next_carry = _stored_carries(replay, step_number, episode_step)
     return Batch(
         window=window,
         action=action,
@@ -290,12 +290,13 @@ def sample_segments(
     key: jax.Array,
     count: jax.Array,
     batch_size: int,
-    tokens: int,
+    window_tokens: int,
     history_length: jax.Array | int,
     length: int,
     burn_in_gradient: bool,
     *,
-    carries_for: str = "critic",
+    critic_reads_carries: bool = True,
+    actor_goes_on: bool = False,
 ) -> Batch:
     """As `sample`, but B / m stretches of m consecutive steps, their first steps uniform.
 
@@ -304,29 +305,33 @@ def sample_segments(
         key: consumed here.
         count: int32 [], steps written so far, at least m.
         batch_size: B, a multiple of m.
-        tokens: L, steps of the burn-in.
+        window_tokens: L, steps of the burn-in.
         history_length: l <= L, steps of the burn-in that may be read.
         length: m.
         burn_in_gradient: whether a gradient flows back into the burn-in.
-        carries_for: who reads the ring's carries, if it keeps any: the ``critic`` of `Batch`, the
-            ``actor`` that goes on with them, or ``both``.
+        critic_reads_carries: whether the batch holds the ring's carries, if it keeps any, for the
+            critic.
+        actor_goes_on: whether its segments begin with those carries, from which the actor goes on.
     """
     oldest = jnp.maximum(count - replay.transitions.reward.shape[0], 0)
     first = jax.random.randint(key, (batch_size // length,), oldest, count - length + 1, jnp.int32)
-    rows = replay, first, count, tokens, history_length, length, burn_in_gradient
-    return gather_segments(*rows, carries_for=carries_for)
+    rows = replay, first, count, window_tokens, history_length, length, burn_in_gradient
+    return gather_segments(
+        *rows, critic_reads_carries=critic_reads_carries, actor_goes_on=actor_goes_on
+    )
 
 
 def gather_segments(
     replay: Replay,
     first: jax.Array,
     count: jax.Array,
-    tokens: int,
+    window_tokens: int,
     history_length: jax.Array | int,
     length: int,
     burn_in_gradient: bool,
     *,
-    carries_for: str = "critic",
+    critic_reads_carries: bool = True,
+    actor_goes_on: bool = False,
 ) -> Batch:
     """The batch of the stretches that begin at these numbers (int32 [M]); see `sample_segments`.
 
@@ -334,15 +339,24 @@ def gather_segments(
     """
     kept = replay.transitions
     segment, slots = segment_at(
-        kept.step, kept.age, first, count, tokens, length, history_length, burn_in_gradient
+        kept.step,
+        kept.episode_step,
+        first,
+        count,
+        window_tokens,
+        length,
+        history_length,
+        burn_in_gradient,
     )
     slot, action = slots.reshape(-1), segment.action
-    number = flat(first[None, :] + jnp.arange(length, dtype=jnp.int32)[:, None])
+    step_number = flat(first[None, :] + jnp.arange(length, dtype=jnp.int32)[:, None])
     carry = next_carry = None
-    if carries_for in ("critic", "both"):
-        carry, next_carry = _stored_carries(replay, number, kept.age[slot])
-    if carries_for in ("actor", "both") and replay.carries is not None:
-        segment = dataclasses.replace(segment, start=_carry_at(replay.carries, first - tokens))
+    if critic_reads_carries:
+        carry, next_carry = _stored_carries(replay, step_number, kept.episode_step[slot])
+    if actor_goes_on and replay.carries is not None:
+        segment = dataclasses.replace(
+            segment, start=_carry_at(replay.carries, first - window_tokens)
+        )
     following = dataclasses.replace(
         segment,
         observation=kept.next_observation[slot],
@@ -361,24 +375,24 @@ def gather_segments(
 
 
 def _stored_carries(
-    replay: Replay, number: jax.Array, age: jax.Array
+    replay: Replay, step_number: jax.Array, episode_step: jax.Array
 ) -> tuple[Carry | None, Carry | None]:
-    """The behaviour actor's carries before steps ``number`` (int32 [B]) and after them."""
+    """The behaviour actor's carries before steps ``step_number`` (int32 [B]) and after them."""
     if replay.carries is None:
         return None, None
     carry = jax.tree.map(
         lambda part: jnp.where(
-            (age == 0).reshape(-1, *[1] * (part.ndim - 1)), jnp.zeros_like(part), part
+            (episode_step == 0).reshape(-1, *[1] * (part.ndim - 1)), jnp.zeros_like(part), part
         ),
-        _carry_at(replay.carries, number),
+        _carry_at(replay.carries, step_number),
     )
-    return carry, _carry_at(replay.carries, number + 1)
+    return carry, _carry_at(replay.carries, step_number + 1)
 
 
-def _carry_at(carries: Carry, number: jax.Array) -> Carry:
-    slot = _carry_slot(carries, number)
+def _carry_at(carries: Carry, step_number: jax.Array) -> Carry:
+    slot = _carry_slot(carries, step_number)
     return jax.tree.map(lambda kept: kept[slot], carries)
 
 
-def _carry_slot(carries: Carry, number: jax.Array) -> jax.Array:
-    return number % jax.tree.leaves(carries)[0].shape[0]
+def _carry_slot(carries: Carry, step_number: jax.Array) -> jax.Array:
+    return step_number % jax.tree.leaves(carries)[0].shape[0]

@@ -64,7 +64,7 @@ def load_policy(
     cell = _choose(directory, given)
     if seed not in directory.seeds:
         raise UserError(f"{path} has no seed {seed}; its seeds are {directory.seeds}")
-    return directory.policy(cell, seed)
+    return directory.lanes.policy(cell, seed)
 
 
 def _choose(directory: "RunDirectory", wanted: dict[str, Any]) -> "Cell":

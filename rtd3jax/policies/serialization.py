@@ -126,7 +126,7 @@ def restore_policy(
         history_length=jnp.int32(history_length),
         centre_token=jnp.asarray(centre_token),
         algorithm=algorithm,
-        tokens=history_length,
+        window_tokens=history_length,
         observation_size=interface.observation_size,
         action_shape=interface.action_shape,
         memory=memory,

@@ -63,7 +63,7 @@ class Policy:
         centre_token: [A], what tokens hold for an action at the centre of its range: zero, but in
             policies of format 1 the centre in half ranges.
         algorithm: the agent's id.
-        tokens: past tokens in the window's arrays, at least l.
+        window_tokens: past tokens in the window's arrays, at least l.
         observation_size: O.
         action_shape: shape of the environment's action.
         memory: the name of its recurrent cell.
@@ -77,7 +77,7 @@ class Policy:
     history_length: jax.Array
     centre_token: jax.Array
     algorithm: str = struct.field(pytree_node=False)
-    tokens: int = struct.field(pytree_node=False)
+    window_tokens: int = struct.field(pytree_node=False)
     observation_size: int = struct.field(pytree_node=False)
     action_shape: tuple[int, ...] = struct.field(pytree_node=False)
     memory: str = struct.field(pytree_node=False, default="lstm")
@@ -102,7 +102,7 @@ class Policy:
         return PolicyState(
             steps=None
             if runs_on
-            else empty_steps(max(self.tokens, 1), self.observation_size, action_size),
+            else empty_steps(max(self.window_tokens, 1), self.observation_size, action_size),
             previous_action=jnp.zeros((action_size,), jnp.float32),
             time=jnp.int32(0),
             carry=self.network.zero_carry(1) if runs_on else None,
@@ -160,7 +160,7 @@ class Policy:
             time,
             time,
             state.time,
-            self.tokens,
+            self.window_tokens,
             self.history_length,
             observation[None],
             state.previous_action[None],

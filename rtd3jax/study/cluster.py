@@ -25,21 +25,15 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from rtd3jax.errors import UserError, first_line
 from rtd3jax.study.command import import_worlds
+from rtd3jax.study.derive import Reference
 from rtd3jax.study.early import EarlyAnswers
 from rtd3jax.study.execute import Work, train_here, waiting_jobs
+from rtd3jax.study.lane_files import cell_name
+from rtd3jax.study.log import LOG, lane_of, parse_log, steps_reached
 from rtd3jax.study.loggers import Logger
-from rtd3jax.study.memory import job_bytes, lanes_at_once, memory
+from rtd3jax.study.memory_plan import job_bytes, lanes_at_once, usable_memory
 from rtd3jax.study.plan import Cell, label
-from rtd3jax.study.rundir import (
-    LOG,
-    PACKAGES,
-    Reference,
-    RunDirectory,
-    cell_name,
-    lane_of,
-    parse_log,
-    steps_reached,
-)
+from rtd3jax.study.rundir import PACKAGES, RunDirectory
 from rtd3jax.system.versions import versions_of
 from rtd3jax.training.checkpoint import checkpoint_steps
 from rtd3jax.training.lanes import Job, workers
@@ -88,7 +82,7 @@ def train_on_cluster(
     """
     waiting: dict[Cell, list[Job]] = {}
     for job in waiting_jobs(directory, jobs):
-        waiting.setdefault(job.owner[0], []).append(job)
+        waiting.setdefault(job.cell, []).append(job)
     if not waiting:
         return
     ray = _ray()
@@ -98,7 +92,7 @@ def train_on_cluster(
         task = ray.remote(_train_cell)
         pending = {}
         for cell, members in waiting.items():
-            seeds, need = [job.owner[1] for job in members], needs[cell]
+            seeds, need = [job.seed for job in members], needs[cell]
             options = {
                 "num_cpus": need.cpus,
                 "num_gpus": need.gpus,
@@ -249,12 +243,12 @@ def _train_cell(
     cell = directory.cells[index]
     # All cells, because side by side they share a program as wide as the longest window.
     jobs = directory.jobs(work.strategy)
-    own = [job for job in jobs if job.owner[0] == cell and job.owner[1] in seeds]
+    own = [job for job in jobs if job.cell == cell and job.seed in seeds]
     complaints: list[str] = []
-    kept = [checkpoint_steps(directory.checkpoint_directory(cell, seed)) for seed in seeds]
+    kept = [checkpoint_steps(directory.lanes.checkpoint_directory(cell, seed)) for seed in seeds]
     training = time.time()
     # What fits is this node's matter, not the driver's.
-    at_once = lanes_at_once(own, work.strategy, cpus or len(workers()), memory())
+    at_once = lanes_at_once(own, work.strategy, cpus or len(workers()), usable_memory())
     here = dataclasses.replace(work, workers=cpus or None, at_once=at_once)
     train_here(directory, own, here, complaints)
     report = {
@@ -322,9 +316,9 @@ def _outcome(ray: ModuleType, task: Any, directory: RunDirectory, jobs: Sequence
     except Exception as error:
         reason = str(error).strip().splitlines()[-1]
         for job in jobs:
-            cell, seed = job.owner
-            if not directory.is_done(cell, seed):
-                directory.write_error(cell, seed, reason)
+            cell, seed = job.key
+            if not directory.lanes.is_done(cell, seed):
+                directory.lanes.write_error(cell, seed, reason)
         return [f"{label(jobs[0])} failed: {reason}"]
 
 

@@ -3,8 +3,9 @@
 import time
 from collections.abc import Sequence
 
+from rtd3jax.study.derive import Reference, derive
 from rtd3jax.study.report.page import refresh_page
-from rtd3jax.study.rundir import Reference, RunDirectory
+from rtd3jax.study.rundir import RunDirectory
 
 SECONDS = 60.0
 """Between two writings of the tables and the page, at least."""
@@ -22,7 +23,7 @@ class EarlyAnswers:
     def refresh(self) -> None:
         """Write them, unless they were written less than `SECONDS` ago."""
         if time.perf_counter() - self._made > SECONDS:
-            self._directory.derive(self._references)
+            derive(self._directory, self._references)
             if self._page:
                 refresh_page(self._directory, complete=False)
             self._made = time.perf_counter()

@@ -4,11 +4,12 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
+from rtd3jax.study.derive import Reference
 from rtd3jax.study.early import EarlyAnswers
 from rtd3jax.study.loggers import Logger
 from rtd3jax.study.plan import label
 from rtd3jax.study.recorder import Recorder
-from rtd3jax.study.rundir import Reference, RunDirectory
+from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.lanes import Group, Job, advance_groups, make_groups, workers
 from rtd3jax.training.progress import Progress
@@ -51,7 +52,7 @@ def train_here(
     """
     waiting = waiting_jobs(directory, jobs)
     for job in waiting:
-        directory.error_path(*job.owner).unlink(missing_ok=True)
+        directory.lanes.error_path(*job.key).unlink(missing_ok=True)
     if work.at_once < len(waiting) and not work.quiet:
         print(f"memory for {work.at_once:,} lanes at once: the others wait for their turn")
     devices = workers()[: work.workers]
@@ -70,7 +71,7 @@ def train_here(
 
 def waiting_jobs(directory: RunDirectory, jobs: Sequence[Job]) -> list[Job]:
     """Those that are not done; says so where some are."""
-    waiting = [job for job in jobs if not directory.is_done(*job.owner)]
+    waiting = [job for job in jobs if not directory.lanes.is_done(*job.key)]
     if len(waiting) < len(jobs):
         print(f"{len(jobs) - len(waiting)} of {len(jobs)} lanes are there already")
     return waiting
@@ -82,7 +83,9 @@ def checkpoints_of(
     """Where the lanes of a run keep their checkpoints, and as what."""
 
     def identity(job: Job) -> dict[str, Any]:
-        cell, seed = job.owner
-        return {**cell.to_dict(), "seed": seed, "window": job.program.tokens}
+        cell, seed = job.key
+        return {**cell.to_dict(), "seed": seed, "window": job.program.window_tokens}
 
-    return Checkpoints(lambda job: directory.checkpoint_directory(*job.owner), identity, *interval)
+    return Checkpoints(
+        lambda job: directory.lanes.checkpoint_directory(*job.key), identity, *interval
+    )

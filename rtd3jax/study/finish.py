@@ -3,8 +3,9 @@
 from collections.abc import Sequence
 
 from rtd3jax.study.ceilings import compute_ceilings
+from rtd3jax.study.derive import Reference, derive
 from rtd3jax.study.report.page import refresh_page
-from rtd3jax.study.rundir import Reference, RunDirectory
+from rtd3jax.study.rundir import RunDirectory
 
 
 def finish(
@@ -26,6 +27,6 @@ def finish(
     complete = page and directory.has_ended() and not interrupted
     if complete:
         compute_ceilings(directory.path, directory.cells)
-    directory.derive(references)
+    derive(directory, references)
     if page:
         refresh_page(directory, complete=complete)

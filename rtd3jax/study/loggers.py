@@ -20,8 +20,9 @@ from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 from rtd3jax.errors import UserError, first_line
+from rtd3jax.study.lane_files import cell_name
 from rtd3jax.study.plan import Cell
-from rtd3jax.study.rundir import RunDirectory, cell_name
+from rtd3jax.study.rundir import RunDirectory
 
 METRIC = "evaluation/return"
 LEARNING = "learning/"

@@ -49,7 +49,7 @@ def study_seconds(
     for number, place in enumerate(places, 1):
         program = programs[place]
         config = program.config
-        say(f"timing {number} of {len(places)}: {config.algorithm} l={config.tokens}")
+        say(f"timing {number} of {len(places)}: {config.algorithm} l={config.window_tokens}")
         width = 1 if strategy == "map" else -(-len(lanes[program]) // devices)
         timed[program] = group_seconds(lanes[program][:width])
     whole = _filled_in(programs, timed, operations)

@@ -12,7 +12,7 @@ from rtd3jax.config import Config
 from rtd3jax.envs.registry import make, parse_disturbance
 from rtd3jax.errors import UserError
 from rtd3jax.registries import AGENTS
-from rtd3jax.study.memory import job_bytes, lanes_at_once
+from rtd3jax.study.memory_plan import job_bytes, lanes_at_once
 from rtd3jax.study.pace import study_seconds
 from rtd3jax.training.lanes import Job, workers
 from rtd3jax.training.run import make_jobs
@@ -68,7 +68,7 @@ class Cell:
 
 def label(job: Job) -> str:
     """A cell in a few words, for people."""
-    cell, _ = job.owner
+    cell, _ = job.key
     length = f" l={cell.config.history_length}" if cell.config.history_length else ""
     return f"{cell.config.algorithm}{length} {cell.disturbance}"
 
@@ -124,7 +124,7 @@ def _windows(cells: Sequence[Cell], stages: Sequence[int]) -> list[int]:
     for end in (*stages, len(cells)):
         stage = cells[len(found) : end]
         for cell in stage:
-            longest[cell.env] = max(longest.get(cell.env, 0), cell.config.tokens)
+            longest[cell.env] = max(longest.get(cell.env, 0), cell.config.window_tokens)
         found += [longest[cell.env] for cell in stage]
     return found
 
@@ -187,9 +187,9 @@ def update_flops(config: Config) -> float:
         if not network.reads.memory or network.reads.carry_from_replay:
             return present(network)
         if segments:
-            return passed(network, config.tokens) + present(network)
+            return passed(network, config.window_tokens) + present(network)
         # The first token has no carry.
-        return config.tokens * sum(token(network)) - token(network)[1] + present(network)
+        return config.window_tokens * sum(token(network)) - token(network)[1] + present(network)
 
     def passed(network: Network, burn_in: int) -> float:
         """One pass over the tokens of all segments."""
@@ -199,12 +199,12 @@ def update_flops(config: Config) -> float:
     def recorded(network: Network) -> float:
         """At what was done: a segment's own tokens."""
         if segments and network.reads.memory and not network.reads.carry_from_replay:
-            return passed(network, config.tokens) + head(network)
+            return passed(network, config.window_tokens) + head(network)
         return forward(network)
 
     def backward(network: Network) -> float:
         if segments and network.reads.memory and not network.reads.carry_from_replay:
-            burn_in = config.tokens if config.burn_in_gradient else 0
+            burn_in = config.window_tokens if config.burn_in_gradient else 0
             return 2 * (passed(network, burn_in) + head(network))
         return 2 * forward(network) - token(network)[1] * network.reads.carry_from_replay
 

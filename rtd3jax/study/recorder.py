@@ -8,9 +8,10 @@ import numpy as np
 
 from rtd3jax.evaluation.rollout import both_returns
 from rtd3jax.study.early import EarlyAnswers
+from rtd3jax.study.log import LOG, repair_log
 from rtd3jax.study.loggers import Logger
 from rtd3jax.study.plan import label
-from rtd3jax.study.rundir import LOG, RunDirectory
+from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.lanes import Group, Job
 from rtd3jax.training.loop import HEALTHY
@@ -39,7 +40,7 @@ class Recorder:
         self._early = early
         self._logger = logger
         self._logged: dict[int, int] = {}
-        self._there = directory.repair_log()
+        self._there = repair_log(directory.path / LOG)
         self._began = time.perf_counter()
         self._complaints = complaints
         self._keep_checkpoints = keep
@@ -49,8 +50,8 @@ class Recorder:
         if group.error is not None:
             reason = str(group.error).splitlines()[0] if str(group.error) else repr(group.error)
             for job in group.jobs:
-                cell, seed = job.owner
-                self._directory.write_error(cell, seed, reason)
+                cell, seed = job.key
+                self._directory.lanes.write_error(cell, seed, reason)
                 self._complaints.append(f"{label(job)} seed {seed} failed: {reason}")
             return
         self._log(group)
@@ -71,7 +72,7 @@ class Recorder:
         assert group.returns is not None and group.metrics is not None
         with (self._directory.path / LOG).open("a", encoding="utf-8") as log:
             for index, job in enumerate(group.jobs):
-                cell, seed = job.owner
+                cell, seed = job.key
                 curve, steps = group.returns[index], evaluation_steps(cell.config)
                 reached = int(np.sum(steps <= group.step))
                 for k in range(self._logged.get(id(job), 0), reached):
@@ -95,7 +96,7 @@ class Recorder:
                 self._logged[id(job)] = reached
 
     def _keep(self, job: Job, state: Any) -> None:
-        cell, seed = job.owner
+        cell, seed = job.key
         failure = failure_of(seed, state)
         returns, true_returns = curves_of(cell.config, state, failure)
         final = np.full((2, self._directory.episodes), np.nan, np.float32)
@@ -108,7 +109,7 @@ class Recorder:
             self._complaints.append(
                 f"{label(job)} seed {seed} was lost at step {failure.step}: {failure.reason}"
             )
-        self._directory.write_lane(
+        self._directory.lanes.write_lane(
             cell,
             seed,
             policy.parameters(),

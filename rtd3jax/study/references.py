@@ -10,8 +10,8 @@ from rtd3jax.errors import UserError, first_line
 from rtd3jax.evaluation.rollout import both_returns
 from rtd3jax.policies.baselines import constant_policy, random_policy
 from rtd3jax.registries import AGENTS
+from rtd3jax.study.derive import Reference
 from rtd3jax.study.plan import Cell
-from rtd3jax.study.rundir import Reference
 
 EPISODES = 1_000
 

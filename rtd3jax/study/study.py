@@ -23,12 +23,13 @@ from rtd3jax.study.figures import final_returns, learning_curves
 from rtd3jax.study.finish import finish
 from rtd3jax.study.lock import writer
 from rtd3jax.study.loggers import check_loggers, open_loggers
-from rtd3jax.study.memory import lanes_at_once, memory
+from rtd3jax.study.memory_plan import lanes_at_once, usable_memory
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.references import references_of
 from rtd3jax.study.report.page import write_page
 from rtd3jax.study.results import CURVES, EPISODES, METRICS, read_table
 from rtd3jax.study.rundir import CONFIG, RunDirectory
+from rtd3jax.study.status import ledger
 from rtd3jax.system.files import user_path
 from rtd3jax.training.lanes import workers
 from rtd3jax.training.run import check_seeds, check_strategy
@@ -103,7 +104,7 @@ class Study:
         with writer(directory.path, None):
             directory.refresh()
             jobs = directory.jobs(strategy)
-            at_once = lanes_at_once(jobs, strategy, len(workers()), memory())
+            at_once = lanes_at_once(jobs, strategy, len(workers()), usable_memory())
             interval = (checkpoint_seconds, None)
             work = Work(strategy, at_once, interval, quiet=quiet, page=page, keep=keep_checkpoints)
             references = references_of(directory.cells)
@@ -118,7 +119,7 @@ class Study:
 
     def status(self) -> pd.DataFrame:
         """A row per lane: its cell, its seed, how far it is, and why it ended if it was lost."""
-        return pd.DataFrame(self._directory.ledger())
+        return pd.DataFrame(ledger(self._directory))
 
     def tables(self) -> dict[str, pd.DataFrame]:
         """The tables ``curves``, ``episodes`` and ``metrics``, of the lanes that are done.
@@ -152,7 +153,7 @@ class Study:
         Raises:
             UserError: when the lane is not done, or was lost.
         """
-        return self._directory.policy(cell, seed)
+        return self._directory.lanes.policy(cell, seed)
 
 
 def _distinct(cells: Iterable[Cell]) -> list[Cell]:

@@ -43,7 +43,7 @@ def transfer(
     worlds: dict[tuple[str, str], Any] = {}
     problems: dict[tuple[str, str, str], int] = {}
     # A file is read once, not for each disturbance.
-    policy_of = functools.lru_cache(maxsize=len(directory.seeds))(directory.policy)
+    policy_of = functools.lru_cache(maxsize=len(directory.seeds))(directory.lanes.policy)
     for cell in directory.cells if cells is None else cells:
         own = list(dict.fromkeys(c.disturbance for c in directory.cells if c.env == cell.env))
         for disturbance in own if tested_on is None else tested_on:
@@ -53,7 +53,7 @@ def transfer(
                 worlds[world] = make(cell.env, name, **parameters)
             for seed in directory.seeds:
                 try:
-                    if not directory.is_done(cell, seed):
+                    if not directory.lanes.is_done(cell, seed):
                         continue
                     both = both_returns(policy_of(cell, seed), worlds[world], episodes, seed)
                 except UserError as error:
@@ -64,7 +64,7 @@ def transfer(
                     {
                         "env": cell.env,
                         "algorithm": cell.config.algorithm,
-                        "history_length": cell.config.tokens,
+                        "history_length": cell.config.window_tokens,
                         "trained_on": cell.disturbance,
                         "tested_on": disturbance,
                         "seed": seed,

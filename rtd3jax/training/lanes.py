@@ -33,17 +33,24 @@ _FIRST_CHUNK = 32
 
 @dataclasses.dataclass(eq=False)
 class Job:
-    """One lane to be trained: its program, its numbers, and who it is to its owner.
+    """One lane to be trained: its program, what is its own, and what it is called.
 
     Attributes:
         program: what is compiled.
-        lane: the numbers.
-        owner: (cell, seed); jobs of one cell stand together in a list of jobs.
+        lane: its seed, hyperparameters and environment parameters.
+        cell: what it is a lane of; jobs of one cell stand together in a list of jobs.
+        seed: which of the cell's lanes it is.
     """
 
     program: Program
     lane: Lane
-    owner: Any
+    cell: Any
+    seed: int
+
+    @property
+    def key(self) -> tuple[Any, int]:
+        """What tells it from all other jobs."""
+        return self.cell, self.seed
 
 
 @dataclasses.dataclass(eq=False)
@@ -187,9 +194,9 @@ class _Pool:
     def __init__(self, groups: Sequence[Group]):
         self._idle = [group for group in groups if not group.finished]
         self._busy = 0
-        cells = list(dict.fromkeys(id(group.jobs[0].owner[0]) for group in groups))
+        cells = list(dict.fromkeys(id(group.jobs[0].cell) for group in groups))
         self._rank = {
-            id(group): (group.wave, cells.index(id(group.jobs[0].owner[0]))) for group in groups
+            id(group): (group.wave, cells.index(id(group.jobs[0].cell))) for group in groups
         }
         self._events: list[Group] = []
         self._stopped = False

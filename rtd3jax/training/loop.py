@@ -75,7 +75,7 @@ class LaneState:
         env_state: the environment's own.
         observation: [O], the one to act upon.
         previous_action: [A], in half ranges as all actions of an agent; zero at an episode's start.
-        age: int32 [], steps done in the episode.
+        episode_step: int32 [], steps done in the episode.
         carry: the actor's, leaves [1, ...], where it runs on from the episode's start; else None.
         returns: [K], mean return of each evaluation so far.
         true_returns: [K], the same of the undisturbed state's reward.
@@ -90,7 +90,7 @@ class LaneState:
     env_state: Any
     observation: jax.Array
     previous_action: jax.Array
-    age: jax.Array
+    episode_step: jax.Array
     carry: Carry | None
     returns: jax.Array
     true_returns: jax.Array
@@ -126,9 +126,9 @@ class Program:
         return math.prod(self.action_shape)
 
     @property
-    def tokens(self) -> int:
+    def window_tokens(self) -> int:
         """Past tokens in the window's arrays."""
-        return self.config.tokens
+        return self.config.window_tokens
 
     @property
     def metric_names(self) -> tuple[str, ...]:
@@ -154,7 +154,7 @@ class Program:
             env_state=env_state,
             observation=observation.astype(jnp.float32),
             previous_action=jnp.zeros((self.action_size,), jnp.float32),
-            age=jnp.int32(0),
+            episode_step=jnp.int32(0),
             carry=self.agent.zero_carry(),
             returns=jnp.full((self.evaluations,), jnp.nan, jnp.float32),
             true_returns=jnp.full((self.evaluations,), jnp.nan, jnp.float32),
@@ -178,7 +178,7 @@ class Program:
             algorithm=self.config.algorithm,
             memory=self.config.memory,
             acting="carry" if self.config.runs_on else "window",
-            tokens=self.tokens,
+            window_tokens=self.window_tokens,
             observation_size=self.observation_size,
             action_shape=self.action_shape,
         )
@@ -188,7 +188,7 @@ class Program:
         return Bounds(*action_bounds(self.env, lane.env_params))
 
     def _step(self, lane: Lane, state: LaneState, step: jax.Array) -> LaneState:
-        numbers = lane.hyperparameters
+        hyperparameters = lane.hyperparameters
         root = jax.random.key(lane.seed)
         act_key, learn_key, env_key = jax.random.split(
             jax.random.fold_in(jax.random.fold_in(root, _STEPS), step), 3
@@ -201,20 +201,20 @@ class Program:
         present = present_window(
             state.replay,
             step,
-            state.age,
+            state.episode_step,
             state.observation,
             state.previous_action,
             self.agent.acting_tokens,
-            numbers.history_length,
+            hyperparameters.history_length,
         )
         window = normalised(present, normaliser)
         greedy, kept = self.agent.act(state.learner.actor, window, state.carry)
-        action = self._explore(greedy, act_key, numbers, step)
+        action = self._explore(greedy, act_key, hyperparameters, step)
         carry = self.agent.carry_after(state.learner.actor, window, action[None], state.carry)
-        replay = keep_acting_carry(state.replay, step, state.age, kept)
+        replay = keep_acting_carry(state.replay, step, state.episode_step, kept)
 
         learner, metrics, loss = self._learn(
-            state.learner, replay, normaliser, state.metrics, learn_key, numbers, step
+            state.learner, replay, normaliser, state.metrics, learn_key, hyperparameters, step
         )
 
         command = self.bounds(lane).to_environment(action).reshape(self.action_shape)
@@ -234,7 +234,7 @@ class Program:
                 reward=reward,
                 next_observation=final_observation,
                 terminated=terminated.astype(bool),
-                age=state.age,
+                episode_step=state.episode_step,
             ),
             done,
             final_carry=lambda: self.agent.final_carry(
@@ -242,7 +242,7 @@ class Program:
                 window,
                 action[None],
                 as_read(final_observation[None], normaliser),
-                numbers.history_length,
+                hyperparameters.history_length,
                 carry,
             ),
             # Losses are not negative, and actions not above one.
@@ -257,7 +257,7 @@ class Program:
             env_state=env_state,
             observation=observation.astype(jnp.float32),
             previous_action=jnp.where(done, 0.0, action),
-            age=jnp.where(done, 0, state.age + 1).astype(jnp.int32),
+            episode_step=jnp.where(done, 0, state.episode_step + 1).astype(jnp.int32),
             carry=jax.tree.map(lambda part: jnp.where(done, 0.0, part), carry),
             metrics=note_reward(metrics, reward, done),
         )
@@ -266,11 +266,11 @@ class Program:
         return self._evaluate(lane, state, step + 1)
 
     def _explore(
-        self, greedy: jax.Array, key: jax.Array, numbers: Hyperparameters, step: jax.Array
+        self, greedy: jax.Array, key: jax.Array, hyperparameters: Hyperparameters, step: jax.Array
     ) -> jax.Array:
         """Uniform before learning starts, then the agent's action [1, A] with noise: [A]."""
         uniform_key, noise_key = jax.random.split(key)
-        noisy = add_noise(noise_key, greedy, numbers.exploration_noise)[0]
+        noisy = add_noise(noise_key, greedy, hyperparameters.exploration_noise)[0]
         uniform = jax.random.uniform(uniform_key, noisy.shape, jnp.float32, -1.0, 1.0)
         return jnp.where(step < self.config.learning_starts, uniform, noisy)
 
@@ -281,7 +281,7 @@ class Program:
         normaliser: Normaliser | None,
         metrics: Averages,
         key: jax.Array,
-        numbers: Hyperparameters,
+        hyperparameters: Hyperparameters,
         step: jax.Array,
     ) -> tuple[Any, Averages, jax.Array]:
         """The step's update, if it has one; its critics' loss [], 0 without one."""
@@ -290,11 +290,13 @@ class Program:
         since = step - config.learning_starts
         due = (since >= 0) & (since % config.update_every == 0)
         count = since // config.update_every + 1
-        numbers = numbers.at(step.astype(jnp.float32) / config.total_steps)
+        hyperparameters = hyperparameters.decayed(step.astype(jnp.float32) / config.total_steps)
 
         def learn(learner: Any, metrics: Averages) -> tuple[Any, Averages, jax.Array]:
-            batch = self.agent.sample(replay, keys[0], step, numbers.history_length, normaliser)
-            learner, found = self.agent.update(learner, batch, keys[1:], numbers, count)
+            batch = self.agent.sample(
+                replay, keys[0], step, hyperparameters.history_length, normaliser
+            )
+            learner, found = self.agent.update(learner, batch, keys[1:], hyperparameters, count)
             return learner, note_update(metrics, found), found["critic_loss"].total
 
         def wait(learner: Any, metrics: Averages) -> tuple[Any, Averages, jax.Array]:
@@ -356,7 +358,7 @@ def make_program(
 def make_lane(config: Config, seed: int, env_params: object) -> Lane:
     """A lane of `make_program`'s program, with concrete arrays for leaves."""
     numbers = {name: jnp.float32(getattr(config, name)) for name in traced_fields()}
-    numbers["history_length"] = jnp.int32(config.tokens)
+    numbers["history_length"] = jnp.int32(config.window_tokens)
     env_params = jax.tree.map(_array, env_params)
     return Lane(jnp.uint32(seed), Hyperparameters(**numbers), env_params)
 

@@ -174,8 +174,8 @@ def train(
     groups = make_groups(jobs, strategy, len(workers()), checkpoints=checkpoints)
 
     def label(job: Job) -> str:
-        own = configs[job.owner[0]]
-        number = "" if single else f" {job.owner[0]}"
+        own = configs[job.cell]
+        number = "" if single else f" {job.cell}"
         return f"{own.algorithm} l={own.history_length}{number}"
 
     with Progress(groups, label, enabled=progress, remark=remark) as bar:
@@ -201,22 +201,20 @@ def _checkpoints(
     world = {"env": str(getattr(env, "name", type(env).__name__)), "params": None}
 
     def identity(job: Job) -> dict[str, Any]:
-        index, seed = job.owner
+        index, seed = job.key
         params = [np.asarray(leaf).tolist() for leaf in jax.tree.leaves(job.lane.env_params)]
         return {**configs[index].to_dict(), **world, "params": params, "seed": seed}
 
-    return Checkpoints(
-        lambda job: directories[job.owner[0]] / f"seed-{job.owner[1]}", identity, seconds
-    )
+    return Checkpoints(lambda job: directories[job.cell] / f"seed-{job.seed}", identity, seconds)
 
 
 def _ended(groups: Iterable[Group]) -> dict[tuple[Any, int], tuple[Job, LaneState]]:
-    """The lanes of groups that have ended, by owner; an error of a whole group is raised."""
+    """The lanes of groups that have ended, by key; an error of a whole group is raised."""
     found: dict[tuple[Any, int], tuple[Job, LaneState]] = {}
     for group in groups:
         if group.error is not None:
             raise group.error
-        found.update({job.owner: (job, state) for job, state in group.lanes()})
+        found.update({job.key: (job, state) for job, state in group.lanes()})
     return found
 
 
@@ -236,7 +234,7 @@ def make_jobs(
     cell: object = None,
     window: int | None = None,
 ) -> list[Job]:
-    """A job per seed, owned by ``(cell, seed)``; checks the environment.
+    """A job per seed, which is called ``(cell, seed)``; checks the environment.
 
     With ``window``, jobs of shorter history lengths share the program of that length.
     """
@@ -246,7 +244,7 @@ def make_jobs(
     check_segments(config, _horizon(params))
     interface = describe(env, params)
     program = make_program(env, config, interface.observation_size, interface.action_shape, window)
-    return [Job(program, make_lane(config, seed, params), (cell, seed)) for seed in seeds]
+    return [Job(program, make_lane(config, seed, params), cell, seed) for seed in seeds]
 
 
 def collect(

@@ -22,15 +22,15 @@ def _history(lengths):
     """Rows of whole episodes; every number in them tells where it comes from."""
     rows, number = [], 0
     for episode, length in enumerate(lengths):
-        for age in range(length):
+        for episode_step in range(length):
             rows.append(
                 dict(
-                    observation=[episode, age],
-                    previous_action=[100 * episode + age - 1 if age else 0.0],
-                    action=[100 * episode + age],
-                    next_observation=[episode, age + 1],
-                    age=age,
-                    terminated=age == length - 1 and episode % 2 == 0,
+                    observation=[episode, episode_step],
+                    previous_action=[100 * episode + episode_step - 1 if episode_step else 0.0],
+                    action=[100 * episode + episode_step],
+                    next_observation=[episode, episode_step + 1],
+                    episode_step=episode_step,
+                    terminated=episode_step == length - 1 and episode % 2 == 0,
                     reward=number,
                 )
             )
@@ -42,7 +42,7 @@ def _store(rows, capacity):
     """Write the rows, and carries as the loop does: before each step; after each end."""
     replay = empty_replay(capacity, 2, 1, zero_carry(1, 1))
     for number, row in enumerate(rows):
-        if row["age"]:
+        if row["episode_step"]:
             replay = put_carry(replay, jnp.int32(number), _carry(row["observation"]))
         array = {k: jnp.asarray(v, jnp.float32) for k, v in row.items()}
         replay = put_transition(
@@ -53,7 +53,7 @@ def _store(rows, capacity):
                 reward=array["reward"],
                 next_observation=array["next_observation"],
                 terminated=jnp.asarray(row["terminated"]),
-                age=jnp.int32(row["age"]),
+                episode_step=jnp.int32(row["episode_step"]),
             ),
         )
         replay = put_carry(replay, jnp.int32(number + 1), _carry(row["next_observation"]))
@@ -114,7 +114,9 @@ def test_windows_and_carries_equal_the_oracle(lengths, capacity, tokens, less):
                 assert np.asarray(getattr(window, part))[b].tolist() == list(want)
         assert float(batch.reward[b]) == row["reward"]
         assert bool(batch.terminated[b]) == row["terminated"]
-        carry = _carry(row["observation"]) if row["age"] else Carry(jnp.zeros(1), jnp.zeros(1))
+        carry = (
+            _carry(row["observation"]) if row["episode_step"] else Carry(jnp.zeros(1), jnp.zeros(1))
+        )
         for got, want in (
             (batch.carry, carry),
             (batch.next_carry, _carry(row["next_observation"])),

@@ -49,15 +49,15 @@ def _ring(agent, memory="lstm"):
     put, put_next = jax.jit(put_transition), jax.jit(put_carry)
     for episode, length in enumerate(LENGTHS):
         observation, previous = draw(OBSERVATION), jnp.zeros(ACTION)
-        for age in range(length):
+        for episode_step in range(length):
             action, after = draw(ACTION), draw(OBSERVATION)
-            last = age == length - 1
+            last = episode_step == length - 1
             row = Transition(
                 step=Steps(observation, previous, action),
                 reward=draw(),
                 next_observation=after,
                 terminated=jnp.asarray(last and episode % 2 == 0),
-                age=jnp.int32(age),
+                episode_step=jnp.int32(episode_step),
             )
             replay = put(replay, jnp.int32(number), row)
             if carry is not None:

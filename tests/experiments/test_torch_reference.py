@@ -50,17 +50,17 @@ def replays():
         observation, after = random.standard_normal((2, OBS)).astype(np.float32)
         previous, action = random.standard_normal((2, A)).astype(np.float32)
         carry = random.standard_normal((2, WIDTH)).astype(np.float32)
-        age, terminated = number % 10, number % 7 == 0
+        episode_step, terminated = number % 10, number % 7 == 0
         row = Transition(
             Steps(*map(jnp.asarray, (observation, previous, action))),
             jnp.float32(number),
             jnp.asarray(after),
             jnp.asarray(terminated),
-            jnp.int32(age),
+            jnp.int32(episode_step),
         )
         ours = put_transition(ours, jnp.int32(number), row)
         ours = put_carry(ours, jnp.int32(number), Carry(*map(jnp.asarray, carry)))
-        theirs.put(previous, observation, action, float(number), after, terminated, age)
+        theirs.put(previous, observation, action, float(number), after, terminated, episode_step)
         theirs.put_carry(number, carry)
     return ours, theirs
 

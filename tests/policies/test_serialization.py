@@ -37,7 +37,7 @@ def test_what_was_saved_comes_back(tmp_path, env, algorithm):
     jax.tree.map(np.testing.assert_array_equal, saved.actor, loaded.actor)
     jax.tree.map(np.testing.assert_array_equal, saved.bounds, loaded.bounds)
     assert loaded.algorithm == algorithm and loaded.action_shape == saved.action_shape
-    assert loaded.history_length == saved.history_length == loaded.tokens
+    assert loaded.history_length == saved.history_length == loaded.window_tokens
     # Not a byte of it depends on when or how often it was saved.
     loaded.save(tmp_path / "again.safetensors")
     first, second = (tmp_path / f"{n}.safetensors" for n in ("policy", "again"))

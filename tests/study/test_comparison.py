@@ -10,6 +10,7 @@ from scipy import stats
 
 from rtd3jax import compare as command
 from rtd3jax.study.comparison import compare_runs
+from rtd3jax.study.derive import derive
 from rtd3jax.study.plan import Grid, make_cells
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.statistics import compare
@@ -68,8 +69,8 @@ def make_run(out, grid, better, seeds=(0, 1, 2), **settings):
             curves = {"steps": np.array([60]), "returns": final[:1], "true_returns": final[:1]}
             curves |= {"final_returns": final, "final_true_returns": final + 10}
             interface = policy.interface()
-            directory.write_lane(cell, seed, policy.actor, curves, {}, None, interface)
-    directory.derive([], pictures=False)
+            directory.lanes.write_lane(cell, seed, policy.parameters(), curves, {}, None, interface)
+    derive(directory, [], pictures=False)
     return str(out)
 
 

@@ -10,11 +10,12 @@ import pytest
 
 import rtd3jax as rtd
 from rtd3jax import sweep
-from rtd3jax.study import finish, references, rundir
+from rtd3jax.study import derive, finish, references, rundir
 from rtd3jax.study.contents import Contents
+from rtd3jax.study.lane_files import cell_name
 from rtd3jax.study.lock import writer
 from rtd3jax.study.plan import Cell, cell_jobs
-from rtd3jax.study.rundir import RunDirectory, cell_name
+from rtd3jax.study.rundir import RunDirectory
 
 SETTINGS = dict(hidden_size=4, batch_size=4, learning_starts=10, eval_every=30, eval_episodes=1)
 FLAGS = [f"--{name.replace('_', '-')}={value}" for name, value in SETTINGS.items()]
@@ -32,7 +33,7 @@ def quick():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(references, "EPISODES", 2)
         patch.setattr(finish, "refresh_page", lambda *_, **__: None)
-        patch.setattr(RunDirectory.derive, "__kwdefaults__", {"pictures": False})
+        patch.setattr(derive.derive, "__kwdefaults__", {"pictures": False})
         yield
 
 
@@ -97,7 +98,7 @@ def test_a_training_goes_on_with_more_steps_and_more_seeds(grown, tmp_path):
         training = rtd.train(env, config, seeds, progress=False, checkpoint_dir=tmp_path)
     directory = RunDirectory.open(out)
     for seed in (0, 1):
-        policies = training.policy(seed), directory.policy(directory.cells[0], seed)
+        policies = training.policy(seed), directory.lanes.policy(directory.cells[0], seed)
         for one, other in zip(*(jax.tree.leaves(p) for p in policies), strict=True):
             np.testing.assert_array_equal(one, other)
     shorter = cell("h-td3", total_steps=90).config
@@ -149,9 +150,9 @@ def _directory(path, *cells, seeds=(0,), **options):
 
 def _finish(directory, one, failure=None, checkpoint=None):
     """Write what a lane of seed 0 leaves, without training it."""
-    directory.write_lane(one, 0, {}, {}, {}, failure)
+    directory.lanes.write_lane(one, 0, {}, {}, {}, failure)
     if checkpoint is not None:
-        kept = directory.checkpoint_directory(one, 0)
+        kept = directory.lanes.checkpoint_directory(one, 0)
         kept.mkdir(parents=True)
         (kept / f"step-{checkpoint:09d}.safetensors").write_text("")
 
@@ -161,7 +162,7 @@ def test_more_steps_that_cannot_go_on_are_refused_with_what_to_do(tmp_path):
     _finish(directory, cell())
     with pytest.raises(rtd.UserError, match="1 of its lanes ended at 60 and kept no checkpoint"):
         _directory(tmp_path / "a", cell(total_steps=90))
-    directory.lane_path(cell(), 0).unlink()  # as the message says
+    directory.lanes.lane_path(cell(), 0).unlink()  # as the message says
     _directory(tmp_path / "a", cell(total_steps=90))
 
     falling = cell(final_learning_rate_fraction=0.0)
@@ -178,7 +179,7 @@ def test_more_steps_that_cannot_go_on_are_refused_with_what_to_do(tmp_path):
     lost = {"step": 7, "reason": "it was lost"}
     _finish(_directory(tmp_path / "d"), cell(), failure=lost)
     later = _directory(tmp_path / "d", cell(total_steps=90))
-    assert later.is_done(cell(total_steps=90), 0)  # it would be lost again
+    assert later.lanes.is_done(cell(total_steps=90), 0)  # it would be lost again
 
 
 def test_looking_at_a_study_does_not_let_it_grow(tmp_path):
@@ -231,12 +232,12 @@ def test_killed_while_it_grows_the_study_is_the_old_one(tmp_path, monkeypatch):
 
 def test_a_longer_window_that_comes_later_changes_no_program_side_by_side(tmp_path):
     short, longer = cell("h-td3"), cell("h-td3", history_length=5)
-    alone = {job.owner: job.program for job in cell_jobs([short], [0], "vmap")}
+    alone = {job.key: job.program for job in cell_jobs([short], [0], "vmap")}
     _directory(tmp_path, short)
     _directory(tmp_path, longer)
-    later = {job.owner: job.program for job in RunDirectory.open(tmp_path).jobs("vmap")}
-    assert later[short, 0] == alone[short, 0] and later[short, 0].tokens == 2
-    assert later[longer, 0].tokens == 5
-    at_once = {job.owner: job.program for job in cell_jobs([short, longer], [0], "vmap")}
-    assert at_once[short, 0].tokens == 5
+    later = {job.key: job.program for job in RunDirectory.open(tmp_path).jobs("vmap")}
+    assert later[short, 0] == alone[short, 0] and later[short, 0].window_tokens == 2
+    assert later[longer, 0].window_tokens == 5
+    at_once = {job.key: job.program for job in cell_jobs([short, longer], [0], "vmap")}
+    assert at_once[short, 0].window_tokens == 5
     assert cell_name(short) != cell_name(longer)

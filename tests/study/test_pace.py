@@ -19,12 +19,12 @@ def test_what_is_not_timed_lies_between_what_is(monkeypatch):
     asked = []
 
     def seconds(group):
-        asked.append(group[0].program.tokens)
-        return 10.0 * group[0].program.tokens
+        asked.append(group[0].program.window_tokens)
+        return 10.0 * group[0].program.window_tokens
 
     monkeypatch.setattr(pace, "group_seconds", seconds)
     monkeypatch.setattr(pace, "workers", lambda: [None] * 4)
-    operations = lambda config: float(config.tokens)  # noqa: E731
+    operations = lambda config: float(config.window_tokens)  # noqa: E731
     assert pace.study_seconds(jobs, "map", operations) == pytest.approx(2 * 280 / 4)
     assert len(asked) == pace.MOST_PROGRAMS and {1, 7} <= set(asked)
     # Side by side, each of a program's lanes has a worker of its own here.

@@ -16,8 +16,8 @@ from rtd3jax.agents.replay import empty_replay, gather, gather_segments
 from rtd3jax.agents.variants import ALGORITHMS
 from rtd3jax.config import Config
 from rtd3jax.registries import AGENTS
+from rtd3jax.study.derive import _whose
 from rtd3jax.study.plan import Grid, cell_jobs, make_cells, update_flops
-from rtd3jax.study.rundir import _whose
 
 
 def _unrolled(f, carry, xs, reverse=False):
@@ -113,7 +113,7 @@ def test_side_by_side_a_world_has_the_windows_of_its_own_longest():
     ]
     for strategy, tokens in (("vmap", [2, 2, 5, 5]), ("map", [1, 2, 3, 5])):
         jobs = cell_jobs(make_cells(grids, {}), [0], strategy)
-        assert [job.program.tokens for job in jobs] == tokens
+        assert [job.program.window_tokens for job in jobs] == tokens
 
 
 def test_fields_in_which_cells_differ_have_their_owners():

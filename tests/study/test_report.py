@@ -14,9 +14,10 @@ import rtd3jax as rtd
 from rtd3jax import report, transfer
 from rtd3jax.envs.about import Ceiling
 from rtd3jax.study import ceilings
+from rtd3jax.study.derive import Reference, derive
 from rtd3jax.study.plan import Grid, make_cells
 from rtd3jax.study.report.playback import record_episodes
-from rtd3jax.study.rundir import Reference, RunDirectory
+from rtd3jax.study.rundir import RunDirectory
 
 AGENTS = ("td3", "lstm-td3-1ha1hc")
 GRIDS = {
@@ -42,13 +43,15 @@ def make_run(out, grid):
             curves |= {"final_true_returns": final}
             metrics = {"critic_loss": np.array([np.nan, 2.0 + seed, 1.0], np.float32)}
             interface = policy.interface()
-            directory.write_lane(cell, seed, policy.actor, curves, metrics, None, interface)
+            directory.lanes.write_lane(
+                cell, seed, policy.parameters(), curves, metrics, None, interface
+            )
     chance = np.random.default_rng(1)
     references = [
         Reference(env, disturbance, "random", *chance.normal(-4, 1, (2, 3)))
         for env, disturbance in {(cell.env, cell.disturbance): 0 for cell in directory.cells}
     ]
-    directory.derive(references, pictures=False)
+    derive(directory, references, pictures=False)
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +104,7 @@ def test_the_numbers_are_those_of_the_tables(runs):
 def test_playback_is_what_the_policy_does(runs):
     directory = RunDirectory.open(runs["pendulum"])
     cell = directory.cells[-1]
-    policy, env = directory.policy(cell, 0), cell.make_env()
+    policy, env = directory.lanes.policy(cell, 0), cell.make_env()
     frames = record_episodes(policy, env, 2, 5, 200)
     assert frames["done"][:, -1].all() and not frames["done"][:, :-1].any()
     totals = frames["reward"][..., 0].sum(axis=1)

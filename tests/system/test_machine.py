@@ -109,7 +109,7 @@ def test_slurm(alone, monkeypatch):
 
 
 def test_the_plan_asks_for_it(monkeypatch):
-    from rtd3jax.study import memory
+    from rtd3jax.study import memory_plan
 
-    monkeypatch.setattr(memory, "memory_limit", lambda: 123 * 2**30)
-    assert memory.memory() == 123 * 2**30
+    monkeypatch.setattr(memory_plan, "memory_limit", lambda: 123 * 2**30)
+    assert memory_plan.usable_memory() == 123 * 2**30

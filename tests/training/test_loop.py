@@ -92,24 +92,24 @@ def test_next_observations_belong_to_the_same_episode(rows):
 
 
 def test_ages_and_previous_actions_start_anew_with_each_episode(rows):
-    np.testing.assert_array_equal(rows.age, rows.step.observation[:, 1])
-    first = rows.age == 0
+    np.testing.assert_array_equal(rows.episode_step, rows.step.observation[:, 1])
+    first = rows.episode_step == 0
     assert first.sum() > 8 and not rows.step.previous_action[first].any()
     later = np.flatnonzero(~first)
     np.testing.assert_array_equal(rows.step.previous_action[later], rows.step.action[later - 1])
 
 
 def test_only_terminations_are_marked_terminated(rows):
-    odd, age = rows.step.observation[:, 0] % 2 == 1, rows.age
-    np.testing.assert_array_equal(rows.terminated, odd & (age == 3))
-    assert rows.terminated.any() and (age == 6).any()
+    odd, episode_step = rows.step.observation[:, 0] % 2 == 1, rows.episode_step
+    np.testing.assert_array_equal(rows.terminated, odd & (episode_step == 3))
+    assert rows.terminated.any() and (episode_step == 6).any()
 
 
 def test_stored_carries_are_the_actors_own(lane):
     program, _, state = lane
     # The newest row's next carry is known only once the agent has acted again.
     numbers = jnp.arange(STEPS - 1, dtype=jnp.int32)
-    length = program.tokens
+    length = program.window_tokens
     batch = gather(state.replay, numbers, jnp.int32(STEPS), length, length)
     actor, network = state.learner.actor, program.agent.acting
     for stored, window in ((batch.carry, batch.window), (batch.next_carry, batch.next_window)):
@@ -127,14 +127,14 @@ def test_segments_go_on_from_the_carry_that_was_stored(lane, burn_in_gradient):
     count, length, burn_in = jnp.int32(STEPS), 3, 2
     first = jnp.arange(STEPS - length, dtype=jnp.int32)
     rows = state.replay, first, count, burn_in, burn_in, length, burn_in_gradient
-    stored = gather_segments(*rows, carries_for="actor")
+    stored = gather_segments(*rows, critic_reads_carries=False, actor_goes_on=True)
     number = (first[None, :] + jnp.arange(length)[:, None]).reshape(-1)
-    whole = gather(state.replay, number, count, program.tokens, program.tokens)
+    whole = gather(state.replay, number, count, program.window_tokens, program.window_tokens)
     actor, network = state.learner.actor, program.agent.acting
     for name in ("window", "next_window"):
         want = act(network, actor, getattr(whole, name))
         np.testing.assert_allclose(act(network, actor, getattr(stored, name)), want, atol=1e-6)
-        from_nothing = gather_segments(*rows, carries_for="critic")
+        from_nothing = gather_segments(*rows, critic_reads_carries=True)
         short = act(network, actor, getattr(from_nothing, name))
         assert np.abs(np.asarray(short - want)).max() > 1e-4
 

@@ -195,6 +195,6 @@ def test_a_long_training_without_checkpoints_says_so_once(capsys, monkeypatch, t
 def test_side_by_side_only_lanes_of_the_same_step_advance_together():
     jobs = make_jobs(_rover(), TINY, [0, 1, 2], cell="cell")
     steps = {0: 40, 1: 40, 2: 0}
-    kept = types.SimpleNamespace(newest=lambda job: steps[job.owner[1]])
+    kept = types.SimpleNamespace(newest=lambda job: steps[job.seed])
     groups = make_groups(jobs, "vmap", 1, checkpoints=kept)
-    assert [[job.owner[1] for job in group.jobs] for group in groups] == [[0, 1], [2]]
+    assert [[job.seed for job in group.jobs] for group in groups] == [[0, 1], [2]]

@@ -57,7 +57,7 @@ class Learner(Protocol):
         state: Any,
         batch: Batch,
         keys: jax.Array,
-        numbers: Any,
+        hyperparameters: Any,
         count: jax.Array,
     ) -> tuple[Any, Metrics]:
         """One update.
@@ -67,7 +67,8 @@ class Learner(Protocol):
             state: of `init`.
             batch: of the replay.
             keys: [2], consumed here.
-            numbers: `rtd3jax.agents.hyperparameters.Hyperparameters` of the lane, at this step.
+            hyperparameters: the lane's `rtd3jax.agents.hyperparameters.Hyperparameters`, at this
+                step.
             count: int32 [], 1 for the first update.
         """
 

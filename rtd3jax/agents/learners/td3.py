@@ -94,16 +94,16 @@ class TD3:
         state: TD3State,
         batch: Batch,
         keys: jax.Array,
-        numbers: Hyperparameters,
+        hyperparameters: Hyperparameters,
         count: jax.Array,
     ) -> tuple[TD3State, Metrics]:
         """The critics' update, and every ``policy_delay``-th time the actor's and the targets'."""
         norms = count % NORMS_EVERY == 0
-        state, critic = update_critics(networks, state, batch, keys[0], numbers, norms)
+        state, critic = update_critics(networks, state, batch, keys[0], hyperparameters, norms)
         state, actor = lax.cond(
             count % self.policy_delay == 0,
             lambda before: update_actor_and_targets(
-                networks, before, batch, keys[1], numbers, norms
+                networks, before, batch, keys[1], hyperparameters, norms
             ),
             lambda before: (before, {name: not_measured() for name in ACTOR_METRICS}),
             state,
@@ -121,22 +121,22 @@ def target(
     state: TD3State,
     batch: Batch,
     key: jax.Array,
-    numbers: Hyperparameters,
+    hyperparameters: Hyperparameters,
 ) -> jax.Array:
     """``y = r + gamma (1 - terminated) min_i Q'_i(next, smoothed target action)``: [B].
 
     ``r`` is the reward times ``reward_scale``.
     """
     action = act(networks.actor, state.target_actor, batch.next_window)
-    noise = numbers.target_noise * jax.random.normal(key, action.shape, jnp.float32)
-    clip = numbers.target_noise_clip
+    noise = hyperparameters.target_noise * jax.random.normal(key, action.shape, jnp.float32)
+    clip = hyperparameters.target_noise_clip
     action = jnp.clip(action + jnp.clip(noise, -clip, clip), -1.0, 1.0)
     first, second = (
         _value(networks.critic, critic, batch.next_window, action, batch.next_carry)
         for critic in state.target_critics
     )
     bootstrap = jnp.where(batch.terminated, 0.0, jnp.minimum(first, second))
-    return numbers.reward_scale * batch.reward + numbers.gamma * bootstrap
+    return hyperparameters.reward_scale * batch.reward + hyperparameters.gamma * bootstrap
 
 
 def critic_loss(
@@ -182,11 +182,11 @@ def update_critics(
     state: TD3State,
     batch: Batch,
     key: jax.Array,
-    numbers: Hyperparameters,
+    hyperparameters: Hyperparameters,
     norms: jax.Array,
 ) -> tuple[TD3State, Metrics]:
     """One Adam step of both critics; ``norms`` bool [], whether to measure the gradient's norm."""
-    y = target(networks, state, batch, key, numbers)
+    y = target(networks, state, batch, key, hyperparameters)
     pair = jax.tree.map(lambda *leaves: jnp.stack(leaves), *state.critics)
     # One after the other, so that one tape is alive at a time: two do not fit in a CPU's cache.
     (losses, values), gradients = lax.map(
@@ -197,7 +197,7 @@ def update_critics(
     )
     gradient = tuple(jax.tree.map(lambda leaf, i=i: leaf[i], gradients) for i in range(2))
     critics, optimizer = _descend(
-        state.critics, gradient, state.critic_optimizer, numbers.critic_learning_rate
+        state.critics, gradient, state.critic_optimizer, hyperparameters.critic_learning_rate
     )
     metrics = {
         "critic_loss": measured(jnp.sum(losses)),
@@ -218,17 +218,17 @@ def update_actor_and_targets(
     state: TD3State,
     batch: Batch,
     key: jax.Array,
-    numbers: Hyperparameters,
+    hyperparameters: Hyperparameters,
     norms: jax.Array,
 ) -> tuple[TD3State, Metrics]:
     """One Adam step of the actor, then Polyak averaging of all targets."""
     (loss, saturated), gradient = jax.value_and_grad(actor_loss, has_aux=True)(
-        state.actor, state.critics[0], networks, batch, key, numbers.actor_noise
+        state.actor, state.critics[0], networks, batch, key, hyperparameters.actor_noise
     )
     actor, optimizer = _descend(
-        state.actor, gradient, state.actor_optimizer, numbers.actor_learning_rate
+        state.actor, gradient, state.actor_optimizer, hyperparameters.actor_learning_rate
     )
-    tau, before = numbers.tau, state.actor_optimizer.mu
+    tau, before = hyperparameters.tau, state.actor_optimizer.mu
 
     def average(online, target):
         return jax.tree.map(lambda new, old: old + tau * (new - old), online, target)

@@ -17,6 +17,7 @@ import pandas as pd
 from rtd3jax.config import Config
 from rtd3jax.errors import UserError
 from rtd3jax.study.colours import colour_of, ordered
+from rtd3jax.study.log import LOG, lane_of, read_log, steps_reached
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.results import (
     CELL,
@@ -28,8 +29,9 @@ from rtd3jax.study.results import (
     reference_names,
     rounded_number,
 )
-from rtd3jax.study.rundir import LOG, RunDirectory, lane_of, read_log, steps_reached
+from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.statistics import Summary, iqm_bands, summarise
+from rtd3jax.study.status import ledger
 
 MOST_POINTS = 200
 """Points of a learning curve that are drawn; of a longer one, as many, evenly spaced."""
@@ -238,7 +240,7 @@ def _study(cells: list[Cell], seeds: list[int], episodes: int) -> dict[str, Any]
 
 def _ledger(directory: RunDirectory, notes: list[str]) -> list[dict[str, Any]]:
     try:
-        return directory.ledger()
+        return ledger(directory)
     except UserError as error:
         notes.append(f"the state of the lanes is not known: {error}")
         return []

@@ -48,16 +48,16 @@ def recordings(
     ``record``, only those that are kept.
     """
     count = EPISODES if len(directory.cells) <= MOST_CELLS else 1
-    longest = max(cell.config.tokens for cell in directory.cells)
+    longest = max(cell.config.window_tokens for cell in directory.cells)
     found: list[dict[str, Any]] = []
     problems: dict[str, list[str]] = {}
     for index, cell in enumerate(directory.cells):
         seed = _middle_seed(directory, cell, lanes)
         if seed is None:
             continue
-        digest = hashlib.sha256(directory.lane_path(cell, seed).read_bytes()).hexdigest()
+        digest = hashlib.sha256(directory.lanes.lane_path(cell, seed).read_bytes()).hexdigest()
         stamp = {"format": FORMAT, "lane": digest, "episodes": count}
-        path = directory.playback_path(cell, seed)
+        path = directory.lanes.playback_path(cell, seed)
         kept = _read(path, stamp)
         if kept is None and record:
             try:
@@ -102,10 +102,10 @@ def record_episodes(
 def _recorded(
     directory: RunDirectory, cell: Cell, seed: int, longest: int, count: int
 ) -> dict[str, Any]:
-    env, policy = cell.make_env(), directory.policy(cell, seed)
-    if policy.tokens:
+    env, policy = cell.make_env(), directory.lanes.policy(cell, seed)
+    if policy.window_tokens:
         # One window for all lengths, so that they share a program; a policy minds its own length.
-        policy = dataclasses.replace(policy, tokens=longest)
+        policy = dataclasses.replace(policy, window_tokens=longest)
     limit = int(getattr(env.default_params, "max_steps_in_episode", DEFAULT_STEP_LIMIT))
     drawing = about_of(env, cell.env).drawing or Drawing()
     steps = min(limit, MOST_STEPS)
@@ -176,7 +176,7 @@ def _middle_seed(directory: RunDirectory, cell: Cell, lanes: pd.DataFrame) -> in
     """The seed whose final return is the cell's median (the lower one of two): a typical agent."""
     rows = rows_of(lanes, cell)
     rows = rows[np.isfinite(rows["return"])].sort_values(["return", "seed"])
-    seeds = [int(seed) for seed in rows["seed"] if directory.is_done(cell, int(seed))]
+    seeds = [int(seed) for seed in rows["seed"] if directory.lanes.is_done(cell, int(seed))]
     return seeds[(len(seeds) - 1) // 2] if seeds else None
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import pytest
 
 import rtd3jax as rtd
-from rtd3jax.study import memory
+from rtd3jax.study import memory_plan
 from rtd3jax.training.lanes import make_groups
 from rtd3jax.training.run import make_jobs
 
@@ -32,31 +32,31 @@ def test_the_plan_is_within_15_percent_of_what_xla_reserves(algorithm, length, r
     advance = jax.jit(job.program.advance, donate_argnums=1)
     options = {"xla_cpu_multi_thread_eigen": False}
     used = advance.lower(job.lane, state, step, step).compile(options).memory_analysis()
-    kept, work = memory.job_bytes([job])[job.program]
+    kept, work = memory_plan.job_bytes([job])[job.program]
     assert abs(kept / used.output_size_in_bytes - 1) < 0.01
     assert abs((kept + work) / (used.output_size_in_bytes + used.temp_size_in_bytes) - 1) < 0.15
 
 
 def test_lanes_that_do_not_fit_wait_for_their_turn():
     jobs = _jobs(seeds=10)
-    kept, work = memory.job_bytes(jobs)[jobs[0].program]
+    kept, work = memory_plan.job_bytes(jobs)[jobs[0].program]
     need = (5 * kept + 2 * work) / 0.8
-    assert memory.lanes_at_once(jobs, "map", 2, int(need) + 1) == 4
-    assert memory.lanes_at_once(jobs, "vmap", 2, int(3.5 * (kept + work) / 0.8)) == 3
+    assert memory_plan.lanes_at_once(jobs, "map", 2, int(need) + 1) == 4
+    assert memory_plan.lanes_at_once(jobs, "vmap", 2, int(3.5 * (kept + work) / 0.8)) == 3
     assert [g.wave for g in make_groups(jobs, "map", 2, 4)] == [0] * 4 + [1] * 4 + [2] * 2
     groups = make_groups(jobs, "vmap", 1, 4)
     assert [len(g.jobs) for g in groups] == [4, 4, 2] and [g.wave for g in groups] == [0, 1, 2]
     with pytest.raises(rtd.UserError, match="one lane needs .* lower replay_capacity"):
-        memory.lanes_at_once(jobs, "map", 2, kept)
+        memory_plan.lanes_at_once(jobs, "map", 2, kept)
 
 
 def test_a_small_limit_leaves_room_for_the_process(monkeypatch):
     """With 3 GB four replays of 410 MB were planned, a fifth comes and goes: it was killed."""
     for limit, lanes in ((3_000_000_000, 1_794_137_600), (64_000_000_000, 51_200_000_000)):
-        monkeypatch.setattr(memory, "memory_limit", lambda limit=limit: limit)
-        assert abs(0.8 * memory.memory() - lanes) < 2
-    monkeypatch.setattr(memory, "memory_limit", lambda: 10**9)
-    assert memory.memory() == 0
+        monkeypatch.setattr(memory_plan, "memory_limit", lambda limit=limit: limit)
+        assert abs(0.8 * memory_plan.usable_memory() - lanes) < 2
+    monkeypatch.setattr(memory_plan, "memory_limit", lambda: 10**9)
+    assert memory_plan.usable_memory() == 0
 
 
 @pytest.mark.slow
@@ -72,7 +72,7 @@ def test_chunks_give_the_same_results():
             groups = make_groups(jobs, strategy, 1, at_once)
             advance_groups(groups, lambda group: None)
             found[strategy, at_once] = {
-                job.owner[1]: state.returns for g in groups for job, state in g.lanes()
+                job.seed: state.returns for g in groups for job, state in g.lanes()
             }
     for (strategy, _), returns in found.items():
         for seed, curve in returns.items():

@@ -42,7 +42,7 @@ def state_bytes(job: Job) -> int:
 def working_bytes(config: Config, observation_size: int, action_size: int) -> int:
     """Bytes that a lane needs beside its state while it advances: activations and gradients."""
     row = 4 * config.hidden_size
-    array = (config.tokens + 1) * row
+    array = (config.window_tokens + 1) * row
     counts = count_parameters(
         config.algorithm, observation_size, action_size, config.hidden_size, config.memory
     )
@@ -50,7 +50,7 @@ def working_bytes(config: Config, observation_size: int, action_size: int) -> in
     activations = AGENTS[config.algorithm].peak_arrays * array * config.batch_size
     if config.replay == "segments":
         length = config.segment_steps
-        tokens = (config.tokens + length) * (config.batch_size // length)
+        tokens = (config.window_tokens + length) * (config.batch_size // length)
         activations = AGENTS[config.algorithm].peak_arrays * tokens * row
         activations += _PRESENT_STEPS * config.batch_size * row
     acting = row if config.runs_on else array
@@ -100,7 +100,7 @@ def lanes_at_once(jobs: Sequence[Job], strategy: str, workers: int, memory: int)
     return max(1, fit)
 
 
-def memory() -> int:
+def usable_memory() -> int:
     """Bytes of the device's own memory, or of what this process may use of the machine's.
 
     Of the latter so much that the share of it that lanes may take leaves room for the process.

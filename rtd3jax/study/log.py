@@ -1,0 +1,50 @@
+"""A study's log: a row of JSON for each evaluation of each lane, while they are trained."""
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from rtd3jax.study.results import CELL
+
+LOG = "log.jsonl"
+
+
+def repair_log(path: Path) -> set[tuple[Any, ...]]:
+    """End a line that was cut short; the lanes and steps that the log has."""
+    if path.exists() and not path.read_bytes().endswith(b"\n"):
+        with path.open("a", encoding="utf-8") as file:
+            file.write("\n")
+    return {(*lane_of(row), row["step"]) for row in read_log(path)}
+
+
+def read_log(path: Path) -> list[dict[str, Any]]:
+    """Rows of a log; a line that a killed process left half-written is passed over."""
+    return parse_log(path.read_text("utf-8")) if path.exists() else []
+
+
+def parse_log(text: str) -> list[dict[str, Any]]:
+    """Rows of a part of a log; see `read_log`."""
+    rows = []
+    for line in text.splitlines():
+        try:
+            row = json.loads(line)
+            if isinstance(row["step"], int) and lane_of(row):
+                rows.append(row)
+        except (ValueError, KeyError, TypeError):
+            continue
+    return rows
+
+
+def lane_of(row: dict[str, Any]) -> tuple[Any, ...]:
+    """The lane that a row is of: its cell's key and its seed."""
+    return tuple(row[name] for name in (*CELL, "seed"))
+
+
+def steps_reached(rows: Iterable[dict[str, Any]]) -> dict[tuple[Any, ...], int]:
+    """The last step of each lane in a log."""
+    reached: dict[tuple[Any, ...], int] = {}
+    for row in rows:
+        lane = lane_of(row)
+        reached[lane] = max(row["step"], reached.get(lane, 0))
+    return reached
