@@ -147,6 +147,26 @@ class Config:
             "about its running mean; for plants whose elements differ much in size"
         },
     )
+    start: str = dataclasses.field(
+        default="",
+        metadata={
+            "help": "what training goes on from: a saved policy, or a run directory, whose lane of "
+            "the same agent and seed it is; RUN@DISTURBANCE says of which disturbance [new weights]"
+        },
+    )
+    freeze: str = dataclasses.field(
+        default="",
+        metadata={
+            "help": "parts of the networks whose weights stay as they began, with commas between "
+            "them: actor, critics, or a layer of one, such as actor.memory [none]"
+        },
+    )
+    actor_starts: int | None = _field(
+        None,
+        "environment step from which on the actor is updated, where its critics must learn first "
+        "[learning_starts]",
+        low=0,
+    )
     precision: str = dataclasses.field(
         default="float32",
         metadata={
@@ -179,6 +199,17 @@ class Config:
             )
         if self.replay == "segments":
             self._check_segments()
+        if self.actor_starts is None:
+            object.__setattr__(self, "actor_starts", self.learning_starts)
+        for name in ("start", "freeze"):
+            if not isinstance(getattr(self, name), str):
+                raise UserError(f"{name} must be a text, not {getattr(self, name)!r}")
+        for part in self.frozen:
+            if part.split(".")[0] not in ("actor", "critics"):
+                raise UserError(
+                    f"freeze: {part!r} is not actor or critics, or a layer of one, such as "
+                    "actor.memory"
+                )
         window = 1 + self.window_tokens
         if capacity < max(self.batch_size, window):
             raise UserError(
@@ -286,6 +317,17 @@ class Config:
         """Consecutive transitions in a segment, m; 0 with windows."""
         assert self.segment_length is not None  # resolved when it was made
         return self.segment_length
+
+    @property
+    def frozen(self) -> tuple[str, ...]:
+        """Parts of the networks whose weights stay as they began."""
+        return tuple(part.strip() for part in self.freeze.split(",") if part.strip())
+
+    @property
+    def updates_before_the_actor(self) -> int:
+        """Critic updates before the actor is first updated."""
+        assert self.actor_starts is not None  # resolved when it was made
+        return max(0, -(-(self.actor_starts - self.learning_starts) // self.update_every))
 
     @property
     def capacity(self) -> int:

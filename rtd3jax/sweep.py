@@ -29,6 +29,7 @@ from rtd3jax.study.memory_plan import lanes_at_once, usable_memory
 from rtd3jax.study.plan import make_cells, plan_text
 from rtd3jax.study.references import references_of
 from rtd3jax.study.rundir import RunDirectory
+from rtd3jax.study.starts import add_starts
 from rtd3jax.study.status import ledger
 from rtd3jax.training.lanes import Job, workers
 from rtd3jax.training.run import check_strategy
@@ -100,6 +101,7 @@ def _run(options: argparse.Namespace) -> int:
     at_once = fit or lanes_at_once(jobs, strategy, len(workers()), usable_memory())
     interval = given.parse_interval(options.checkpoint_every)
     shard = _shard(options)
+    add_starts(directory, jobs, write=False)  # before anything is written
     if options.fresh:
         _set_aside(out)
     if news := directory.prepare():

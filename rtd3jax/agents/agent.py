@@ -10,6 +10,7 @@ from typing import Any, Protocol
 
 import jax
 
+from rtd3jax.agents.freeze import check_parts, frozen_parts
 from rtd3jax.agents.history import Window, next_window
 from rtd3jax.agents.hyperparameters import Hyperparameters
 from rtd3jax.agents.learners.base import Learner, Metrics, Networks
@@ -184,7 +185,10 @@ class Agent:
         count: jax.Array,
     ) -> tuple[Any, Metrics]:
         """The ``count``-th update (int32 [], from 1); ``keys`` [2] are consumed here."""
-        return self.learner.update(self.networks, state, batch, keys, hyperparameters, count)
+        new, metrics = self.learner.update(
+            self.networks, state, batch, keys, hyperparameters, count
+        )
+        return frozen_parts(state, new, self.config.frozen), metrics
 
 
 def make_agent(config: Config, interface: Sizes) -> Agent:
@@ -200,6 +204,7 @@ def make_agent(config: Config, interface: Sizes) -> Agent:
         make_part(variant, role, config.memory, *sizes, config.precision)
         for role in ("actor", "critic")
     )
+    check_parts(config.frozen, {"actor": actor, "critics": critic})
     return Agent(
         variant=variant,
         networks=Networks(actor, critic),

@@ -126,8 +126,18 @@ def _excerpt(directory: RunDirectory) -> dict[str, object]:
         "cells": len(directory.cells),
         "seeds": len(directory.seeds),
         "final episodes per seed": directory.episodes,
+        **_began_from(directory),
         **fields,
     }
+
+
+def _began_from(directory: RunDirectory) -> dict[str, object]:
+    """What lanes went on from, where some did."""
+    paths = (
+        directory.lanes.start_path(c, seed) for c in directory.cells for seed in directory.seeds
+    )
+    found = dict.fromkeys(path.read_text("utf-8").strip() for path in paths if path.exists())
+    return {"began from": "; ".join(found)} if found else {}
 
 
 def _whose(name: str, cells: Sequence[Mapping[str, Any]]) -> str:

@@ -10,6 +10,7 @@ from rtd3jax.study.loggers import Logger
 from rtd3jax.study.plan import label
 from rtd3jax.study.recorder import Recorder
 from rtd3jax.study.rundir import RunDirectory
+from rtd3jax.study.starts import add_starts
 from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.lanes import Group, Job, advance_groups, make_groups, workers
 from rtd3jax.training.progress import Progress
@@ -51,6 +52,7 @@ def train_here(
     With ``references``, tables and page are written again about once a minute.
     """
     waiting = waiting_jobs(directory, jobs)
+    add_starts(directory, waiting, write=True)
     for job in waiting:
         directory.lanes.error_path(*job.key).unlink(missing_ok=True)
     if work.at_once < len(waiting) and not work.quiet:

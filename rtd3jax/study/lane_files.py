@@ -133,6 +133,14 @@ class LaneFiles:
             format=about.get("format", 1),
         )
 
+    def start_path(self, cell: Cell, seed: int) -> Path:
+        """Where it stands what a lane began from, if it did not begin with new weights."""
+        return self.lane_path(cell, seed).with_suffix(".start.txt")
+
+    def write_start(self, cell: Cell, seed: int, what: str) -> None:
+        """Keep what a lane begins from."""
+        write_bytes_atomically(self.start_path(cell, seed), (what + "\n").encode())
+
     def write_error(self, cell: Cell, seed: int, reason: str) -> None:
         """Keep the reason for which a lane could not be trained."""
         write_bytes_atomically(self.error_path(cell, seed), (reason + "\n").encode())

@@ -91,7 +91,7 @@ class Checkpoints:
                     f"checkpoint in {directory} cannot be written: {error.strerror}; "
                     "the one before it is kept"
                 ) from error
-            for old in [*_files(directory)[kept:], *_unfinished(directory)]:
+            for old in [*checkpoint_files(directory)[kept:], *_unfinished(directory)]:
                 old.unlink(missing_ok=True)
         now = time.monotonic()
         self._written[id(group)] = (now, step)
@@ -123,7 +123,7 @@ class Checkpoints:
     def discard(self, job: Any) -> None:
         """Remove a lane's checkpoints: it has ended, and its result is kept."""
         directory = self._directory_of(job)
-        for file in [*_files(directory), *_unfinished(directory)]:
+        for file in [*checkpoint_files(directory), *_unfinished(directory)]:
             file.unlink(missing_ok=True)
         if directory.is_dir() and not any(directory.iterdir()):
             directory.rmdir()
@@ -131,7 +131,7 @@ class Checkpoints:
     def _readable(self, job: Any, first: bool) -> dict[int, LaneState]:
         """A lane's sound checkpoints by step, or the newest one; warns of damaged ones."""
         states, complaints = {}, []
-        for file in _files(self._directory_of(job)):
+        for file in checkpoint_files(self._directory_of(job)):
             try:
                 arrays, about = read_arrays(file)
             except UserError as error:
@@ -221,7 +221,7 @@ def versions() -> dict[str, str]:
 
 def checkpoint_steps(directory: Path) -> list[int]:
     """Steps of the checkpoints in a lane's directory, newest first."""
-    return [_step(file) or 0 for file in _files(directory)]
+    return [_step(file) or 0 for file in checkpoint_files(directory)]
 
 
 def to_arrays(state: LaneState) -> dict[str, np.ndarray]:
@@ -270,6 +270,22 @@ def from_arrays(
     )
 
 
+def leaves_from_arrays(expected: Any, arrays: dict[str, np.ndarray], place: str, file: Path) -> Any:
+    """A part of a state, of the structure of ``expected``, from where it stood in the whole.
+
+    Raises:
+        UserError: when the arrays at ``place`` are not such.
+    """
+    leaves, structure = jax.tree_util.tree_flatten_with_path(expected)
+    named = [(place + jax.tree_util.keystr(path), leaf) for path, leaf in leaves]
+    there = {name for name in arrays if name.startswith((f"{place}.", f"{place}["))}
+    if odd := sorted(there ^ {name for name, _ in named}):
+        raise UserError(f"{file} does not fit this agent: array {odd[0]} is missing or too many")
+    return jax.tree.unflatten(
+        structure, [_from_array(arrays[name], leaf, name, file) for name, leaf in named]
+    )
+
+
 def _is_key(leaf: jax.Array) -> bool:
     return jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
@@ -292,7 +308,7 @@ def _from_array(array: np.ndarray, leaf: jax.Array, name: str, file: Path) -> ja
     return value
 
 
-def _files(directory: Path) -> list[Path]:
+def checkpoint_files(directory: Path) -> list[Path]:
     """Checkpoints in ``directory``, newest first."""
     if not directory.is_dir():
         return []

@@ -24,6 +24,7 @@ from rtd3jax.system.machine import cores
 from rtd3jax.system.program_cache import make_room, on_full
 from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.loop import HEALTHY, Lane, LaneState, Program
+from rtd3jax.training.start import Start
 
 CHUNK_SECONDS = 1.0
 """Wall time at which a chunk aims: the pace of progress, and the wait after Ctrl-C."""
@@ -40,12 +41,14 @@ class Job:
         lane: its seed, hyperparameters and environment parameters.
         cell: what it is a lane of; jobs of one cell stand together in a list of jobs.
         seed: which of the cell's lanes it is.
+        start: what was trained before and it goes on from; None for new weights.
     """
 
     program: Program
     lane: Lane
     cell: Any
     seed: int
+    start: Start | None = None
 
     @property
     def key(self) -> tuple[Any, int]:
@@ -293,7 +296,8 @@ def _chunk(group: Group, device: jax.Device, rates: dict[Any, float]) -> None:
     program, width = group.jobs[0].program, len(group.jobs)
     lane = stacked([job.lane for job in group.jobs], device)
     init, advance = compiled(program, lane, width > 1, device)
-    state = init(lane) if group.state is None else jax.device_put(group.state, device)
+    state = _begun(group, init(lane)) if group.state is None else group.state
+    state = jax.device_put(state, device)
     rate = rates.get((program, width))
     steps = _FIRST_CHUNK if rate is None else max(1, int(rate * CHUNK_SECONDS))
     # Before learning starts steps are cheap: a chunk that crosses over would be far too long.
@@ -308,6 +312,18 @@ def _chunk(group: Group, device: jax.Device, rates: dict[Any, float]) -> None:
     if group.step >= warm_up:
         rates[program, width] = (stop - group.step) / seconds
     _advanced(group, state, stop)
+
+
+def _begun(group: Group, state: LaneState) -> LaneState:
+    """The group's new ``state``, of which each lane may go on from what was trained before."""
+    if all(job.start is None for job in group.jobs):
+        return state
+    fresh = dataclasses.replace(group, state=state)
+    lanes = [
+        own if job.start is None else job.start.begin(job.program, job.lane, own)
+        for job, own in fresh.lanes()
+    ]
+    return lanes[0] if len(lanes) == 1 else jax.tree.map(lambda *x: jnp.stack(x), *lanes)
 
 
 _COPIES = 3

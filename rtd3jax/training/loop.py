@@ -268,9 +268,14 @@ class Program:
     def _explore(
         self, greedy: jax.Array, key: jax.Array, hyperparameters: Hyperparameters, step: jax.Array
     ) -> jax.Array:
-        """Uniform before learning starts, then the agent's action [1, A] with noise: [A]."""
+        """Uniform before learning starts, then the agent's action [1, A] with noise: [A].
+
+        A lane that goes on from a trained policy acts by it from its first step.
+        """
         uniform_key, noise_key = jax.random.split(key)
         noisy = add_noise(noise_key, greedy, hyperparameters.exploration_noise)[0]
+        if self.config.start:  # it can act already
+            return noisy
         uniform = jax.random.uniform(uniform_key, noisy.shape, jnp.float32, -1.0, 1.0)
         return jnp.where(step < self.config.learning_starts, uniform, noisy)
 
@@ -349,7 +354,7 @@ def make_program(
     with a stored carry, have the burn-in of their own configuration.
     """
     defaults = {name: getattr(Config, name) for name in traced_fields()}
-    static = dataclasses.replace(config, **defaults)
+    static = dataclasses.replace(config, **defaults, start=config.start and "trained")
     if window is not None and config.has_window and config.replay == "windows":
         static = dataclasses.replace(static, history_length=window)
     return Program(env, static, observation_size, action_shape)

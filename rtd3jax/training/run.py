@@ -1,6 +1,7 @@
 """`train`: seeds of one configuration on one environment; the library's main call."""
 
 import dataclasses
+import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, overload
@@ -34,6 +35,7 @@ from rtd3jax.training.loop import (
     make_program,
 )
 from rtd3jax.training.progress import Progress
+from rtd3jax.training.start import Start, starts_of_path
 from rtd3jax.training.worth import check_segments, warn_if_untrained
 
 _REASONS = {
@@ -92,6 +94,10 @@ class Run:
         return next(failure for failure in self.failures if failure.seed == seed)
 
 
+StartLike = Policy | Run | str | Path | None
+"""What `train` may go on from; None for new weights."""
+
+
 @overload
 def train(
     env: EnvironmentLike,
@@ -103,6 +109,7 @@ def train(
     strategy: str | None = None,
     checkpoint_dir: str | Path | None = None,
     checkpoint_seconds: float | None = None,
+    start: StartLike = None,
 ) -> Run: ...
 
 
@@ -117,6 +124,7 @@ def train(
     strategy: str | None = None,
     checkpoint_dir: str | Path | None = None,
     checkpoint_seconds: float | None = None,
+    start: StartLike = None,
 ) -> list[Run]: ...
 
 
@@ -130,6 +138,7 @@ def train(
     strategy: str | None = None,
     checkpoint_dir: str | Path | None = None,
     checkpoint_seconds: float | None = None,
+    start: StartLike = None,
 ) -> Run | list[Run]:
     """Train one lane per seed, of one configuration or of each of several.
 
@@ -146,6 +155,9 @@ def train(
             ``config-1``, ... Without it, a process that is killed loses everything.
         checkpoint_seconds: between two checkpoints of a lane; five minutes by default, or longer
             where they would cost more than 2%.
+        start: what training goes on from: a `Policy`, a `Run` of the same seeds, the file of a
+            saved policy, or the ``checkpoint_dir`` of another training, which has critics and
+            optimisers too. See also ``freeze`` and ``actor_starts`` of `Config`.
         strategy: ``map`` (lanes one by one, each on one core) or ``vmap`` (side by side); by
             default what suits the backend.
 
@@ -160,10 +172,15 @@ def train(
     if not configs or not all(isinstance(one, Config) for one in configs):
         raise UserError(f"config must be an rtd.Config, or several of them, not {config!r}")
     seeds = check_seeds(seeds)
+    starts = [_starts(start if start is not None else one.start or None, seeds) for one in configs]
+    configs = [
+        dataclasses.replace(one, start=own[seeds[0]].where) if own else one
+        for one, own in zip(configs, starts, strict=True)
+    ]
     jobs = [
         job
-        for index, one in enumerate(configs)
-        for job in make_jobs(env, one, seeds, params=params, cell=index)
+        for index, (one, own) in enumerate(zip(configs, starts, strict=True))
+        for job in make_jobs(env, one, seeds, params=params, cell=index, starts=own)
     ]
     checkpoints = None
     if checkpoint_dir is not None:
@@ -171,6 +188,7 @@ def train(
         parts = [directory] if single else [directory / f"config-{k}" for k in range(len(configs))]
         checkpoints = _checkpoints(parts, configs, env, checkpoint_seconds)
     strategy, remark = check_strategy(strategy), "" if checkpoints is not None else _NO_CHECKPOINTS
+    check_starts(jobs, checkpoints)
     groups = make_groups(jobs, strategy, len(workers()), checkpoints=checkpoints)
 
     def label(job: Job) -> str:
@@ -233,6 +251,7 @@ def make_jobs(
     params: object = None,
     cell: object = None,
     window: int | None = None,
+    starts: Mapping[int, Start] | None = None,
 ) -> list[Job]:
     """A job per seed, which is called ``(cell, seed)``; checks the environment.
 
@@ -244,7 +263,43 @@ def make_jobs(
     check_segments(config, _horizon(params))
     interface = describe(env, params)
     program = make_program(env, config, interface.observation_size, interface.action_shape, window)
-    return [Job(program, make_lane(config, seed, params), cell, seed) for seed in seeds]
+    starts = starts or {}
+    return [
+        Job(program, make_lane(config, seed, params), cell, seed, starts.get(seed))
+        for seed in seeds
+    ]
+
+
+def check_starts(jobs: Iterable[Job], checkpoints: Checkpoints | None) -> None:
+    """Raise UserError where a lane that is new cannot begin from what it is to go on from."""
+    for job in jobs:
+        if job.start is not None and not (checkpoints and checkpoints.newest(job)):
+            job.start.check(job.program, job.lane)
+
+
+def _starts(start: StartLike, seeds: tuple[int, ...]) -> dict[int, Start]:
+    """What each seed goes on from; empty for new weights."""
+    if start is None:
+        return {}
+    if isinstance(start, Policy):
+        digest = hashlib.sha256(b"".join(a.tobytes() for a in start.parameters().values()))
+        name = f"a policy of {start.algorithm} ({digest.hexdigest()[:12]})"
+        return dict.fromkeys(seeds, Start(name, start))
+    if isinstance(start, Run):
+        found = {seed: _starts(start.policy(seed), seeds)[seed] for seed in seeds}
+        name = f"a run of {start.config.algorithm} ({_joint(found)})"
+        return {seed: dataclasses.replace(own, where=name) for seed, own in found.items()}
+    if isinstance(start, str | Path):
+        return starts_of_path(start, seeds)
+    raise UserError(
+        "start must be a policy, a run of rtd.train, the path of a saved policy or a directory of "
+        f"checkpoints, not {start!r}"
+    )
+
+
+def _joint(starts: Mapping[int, Start]) -> str:
+    names = "".join(start.where for start in starts.values())
+    return hashlib.sha256(names.encode()).hexdigest()[:12]
 
 
 def collect(

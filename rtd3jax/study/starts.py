@@ -1,0 +1,84 @@
+"""What the lanes of a cell go on from: lanes of another run directory, or a saved policy."""
+
+from collections.abc import Sequence
+
+from rtd3jax.errors import UserError
+from rtd3jax.study.plan import Cell
+from rtd3jax.study.rundir import RunDirectory
+from rtd3jax.system.files import user_path
+from rtd3jax.training.checkpoint import checkpoint_files
+from rtd3jax.training.lanes import Job
+from rtd3jax.training.start import Start, starts_of_path
+
+
+def add_starts(directory: RunDirectory, jobs: Sequence[Job], *, write: bool) -> None:
+    """Give each job that is still to begin what it goes on from, and see that it can.
+
+    Args:
+        directory: of the study.
+        jobs: of its lanes.
+        write: whether to note what each begins from, beside its lane.
+
+    Raises:
+        UserError: as `starts_of` does, or when it is of another agent or other sizes.
+    """
+    by_cell: dict[Cell, list[Job]] = {}
+    for job in jobs:
+        begun = checkpoint_files(directory.lanes.checkpoint_directory(*job.key))
+        if job.cell.config.start and not begun and not directory.lanes.is_done(*job.key):
+            by_cell.setdefault(job.cell, []).append(job)
+    for cell, own in by_cell.items():
+        starts = starts_of(cell, [job.seed for job in own])
+        for job in own:
+            job.start = starts[job.seed]
+            job.start.check(job.program, job.lane)
+            if write:
+                directory.lanes.write_start(cell, job.seed, job.start.about)
+
+
+def starts_of(cell: Cell, seeds: Sequence[int]) -> dict[int, Start]:
+    """Of each seed; empty where the cell begins with new weights.
+
+    Raises:
+        UserError: when ``start`` of the cell's configuration names nothing that can be read, or no
+            lane of the same agent and seed.
+    """
+    if not cell.config.start:
+        return {}
+    path, _, disturbance = cell.config.start.partition("@")
+    if not user_path(path).is_dir():
+        return starts_of_path(cell.config.start, tuple(seeds))
+    directory = RunDirectory.open(path)
+    return {seed: _start(directory, cell, seed, disturbance) for seed in seeds}
+
+
+def _start(directory: RunDirectory, cell: Cell, seed: int, disturbance: str) -> Start:
+    config, path = cell.config, directory.path
+    fitting = [
+        other
+        for other in directory.cells
+        if (other.config.algorithm, other.config.memory) == (config.algorithm, config.memory)
+        and disturbance in ("", other.disturbance)
+    ]
+    same = [c for c in fitting if c.config.history_length == config.history_length]
+    fitting = same or fitting
+    wanted = f"{config.algorithm}{f' under {disturbance}' if disturbance else ''}"
+    if not fitting:
+        there = dict.fromkeys(
+            f"{c.config.algorithm} under {c.disturbance}" for c in directory.cells
+        )
+        raise UserError(f"{path} has no {wanted} to begin from, only {', '.join(there)}")
+    if len(fitting) > 1:
+        names = dict.fromkeys(f"{path}@{other.disturbance}" for other in fitting)
+        raise UserError(
+            f"{len(fitting)} cells of {path} fit {wanted}; say which disturbance: "
+            f"{' or '.join(names)}"
+        )
+    (other,) = fitting
+    if seed not in directory.seeds:
+        raise UserError(f"{path} has no seed {seed} to begin from; its seeds are {directory.seeds}")
+    where = f"{path} {other.env} {other.disturbance}"
+    kept = checkpoint_files(directory.lanes.checkpoint_directory(other, seed))
+    if kept and directory.lanes.is_done(other, seed):
+        return Start(where, checkpoint=kept[0])
+    return Start(where, policy=directory.lanes.policy(other, seed))

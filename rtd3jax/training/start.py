@@ -1,0 +1,149 @@
+"""Training that goes on from what was trained before: a policy, or a lane's whole learner.
+
+A policy gives its actor, and the statistics by which it reads observations. A checkpoint gives the
+critics, the targets and the optimisers as well. Replay, the plant's state and random numbers are
+the new lane's own.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rtd3jax.agents.normalise import Normaliser, Statistics
+from rtd3jax.errors import UserError
+from rtd3jax.policies.serialization import read_policy
+from rtd3jax.policies.trained import Policy
+from rtd3jax.system.files import read_arrays, user_path
+from rtd3jax.training.checkpoint import checkpoint_files, leaves_from_arrays
+from rtd3jax.training.loop import Lane, LaneState, Program
+
+KNOWN_OBSERVATIONS = 1_000
+"""What a policy's statistics weigh, in observations, against those that the new lane will see."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Start:
+    """What one lane begins from.
+
+    Attributes:
+        where: what it is, for people.
+        policy: the trained policy, where that is all there is; a file of one is read when needed.
+        checkpoint: the file of a lane that has more; None otherwise.
+    """
+
+    where: str
+    policy: Policy | Path | None = None
+    checkpoint: Path | None = None
+
+    @property
+    def about(self) -> str:
+        """What is taken from where, for tables."""
+        whole = "actor, critics and optimisers" if self.checkpoint is not None else "actor"
+        return f"{whole} of {self.where}"
+
+    def begin(self, program: Program, lane: Lane, state: LaneState) -> LaneState:
+        """The lane's ``state`` before its first step, with what was trained before.
+
+        Raises:
+            UserError: when it is of another agent, of other sizes, or cannot be read.
+        """
+        if self.checkpoint is not None:
+            return self._whole(program, lane, state)
+        policy = self.policy if isinstance(self.policy, Policy) else read_policy(self.where)
+        self._check(program, policy)
+        statistics = state.statistics
+        if policy.normaliser is not None:
+            statistics = _statistics_of(policy.normaliser)
+        learner = state.learner
+        # Copies: a lane's buffers are donated, and the policy stays its owner's.
+        names = [name for name in ("actor", "target_actor") if hasattr(learner, name)]
+        parts = {name: jax.tree.map(jnp.array, policy.actor) for name in names}
+        learner = dataclasses.replace(learner, **parts)
+        return dataclasses.replace(state, learner=learner, statistics=statistics)
+
+    def check(self, program: Program, lane: Lane) -> None:
+        """Raise as `begin` would, before anything is compiled."""
+        self.begin(program, lane, jax.eval_shape(program.init, lane))
+
+    def _check(self, program: Program, policy: Policy) -> None:
+        config, sizes = program.config, (program.observation_size, program.action_size)
+        there = {
+            "algorithm": policy.algorithm,
+            "memory": policy.memory,
+            "hidden_size": policy.width,
+            "normalise_observations": policy.normaliser is not None,
+        }
+        self._compare(there, config.to_dict(), program)
+        own = policy.observation_size, int(np.prod(policy.action_shape, dtype=int))
+        if own != sizes:
+            raise UserError(
+                f"{self.where} is of a plant with {own[0]} observation and {own[1]} action "
+                f"elements, and this one has {sizes[0]} and {sizes[1]}"
+            )
+        if np.any(np.asarray(policy.centre_token)):
+            raise UserError(
+                f"{self.where} was written by rtd3jax 0.1 for actions whose range is not about "
+                "zero; no training can go on from it"
+            )
+
+    def _compare(self, there: Mapping[str, Any], here: Mapping[str, Any], program: Program) -> None:
+        fields = ["algorithm", "hidden_size", "normalise_observations"]
+        if program.agent.acting.memory is not None:
+            fields.append("memory")
+        for name in fields:
+            if there.get(name) != here[name]:
+                raise UserError(
+                    f"{self.where} has {name}={there.get(name)}, and the new training "
+                    f"{here[name]}: they must agree"
+                )
+
+    def _whole(self, program: Program, lane: Lane, state: LaneState) -> LaneState:
+        assert self.checkpoint is not None
+        arrays, about = read_arrays(self.checkpoint)
+        identity = about.get("identity") if isinstance(about, dict) else None
+        self._compare(identity or {}, program.config.to_dict(), program)
+        expected = jax.eval_shape(program.init, lane)
+        found = {
+            name: leaves_from_arrays(getattr(expected, name), arrays, f".{name}", self.checkpoint)
+            for name in ("learner", "statistics")
+        }
+        return dataclasses.replace(state, **found)
+
+
+def starts_of_path(path: str | Path, seeds: tuple[int, ...]) -> dict[int, Start]:
+    """Of each seed, from a saved policy, or from the ``checkpoint_dir`` of a `rtd.train`.
+
+    Raises:
+        UserError: when there is neither, or a seed has no checkpoint there.
+    """
+    path = user_path(path)
+    if not path.is_dir():
+        policy = read_policy(path)
+        return dict.fromkeys(seeds, Start(str(path), policy))
+    if (path / "config.json").exists():
+        raise UserError(
+            f"{path} is a run directory: give a policy of it, rtd.load_policy({str(path)!r}, ...), "
+            "or use rtd.Study"
+        )
+    found = {}
+    for seed in seeds:
+        files = checkpoint_files(path / f"seed-{seed}")
+        if not files:
+            raise UserError(
+                f"{path} is no saved policy, and has no checkpoint of seed {seed} to begin from"
+            )
+        found[seed] = Start(f"{path} seed {seed}", checkpoint=files[0])
+    return found
+
+
+def _statistics_of(normaliser: Normaliser) -> Statistics:
+    return Statistics(
+        jnp.int32(KNOWN_OBSERVATIONS),
+        jnp.array(normaliser.mean),
+        1.0 / jnp.square(normaliser.scale),
+    )

@@ -1,0 +1,223 @@
+"""Training that goes on from a policy or a checkpoint, with parts that stay or wait."""
+
+import dataclasses
+import shutil
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from random_policies import random_policy
+
+import rtd3jax as rtd
+from rtd3jax import sweep
+from rtd3jax.agents.freeze import frozen_parts
+from rtd3jax.study import finish, references
+from rtd3jax.study.derive import derive
+from rtd3jax.study.rundir import RunDirectory
+from rtd3jax.study.starts import starts_of
+from rtd3jax.training.run import make_jobs
+from rtd3jax.training.start import KNOWN_OBSERVATIONS, starts_of_path
+
+SMALL = dict(
+    algorithm="td3",
+    total_steps=60,
+    hidden_size=8,
+    batch_size=4,
+    learning_starts=20,
+    eval_every=30,
+    eval_episodes=1,
+    normalise_observations=True,
+)
+
+
+@dataclasses.dataclass
+class Pair:
+    """A learner's networks."""
+
+    actor: dict
+    critics: tuple
+
+
+def _config(**changes):
+    return rtd.Config(**{**SMALL, **changes})
+
+
+@pytest.fixture(scope="module")
+def env():
+    return rtd.make("rover", "sine-slip")
+
+
+@pytest.fixture(scope="module")
+def kept(env, tmp_path_factory):
+    """A run of two seeds, and the directory of its checkpoints."""
+    directory = tmp_path_factory.mktemp("kept")
+    run = rtd.train(env, _config(), [0, 1], progress=False, checkpoint_dir=directory)
+    return run, directory
+
+
+def _same(one, other):
+    return all(
+        np.array_equal(a, b)
+        for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+    )
+
+
+def test_a_lane_acts_by_the_policy_while_parts_stay_and_the_actor_waits(env, kept, tmp_path):
+    run, _ = kept
+    policy = run.policy(0)
+    policy.save(tmp_path / "p.safetensors")
+    start = starts_of_path(tmp_path / "p.safetensors", (0,))[0]
+    fields = dict(exploration_noise=0.0, actor_starts=40, freeze="actor.head, critics.current")
+    (job,) = make_jobs(env, _config(start="p", **fields), [0], starts={0: start})
+    state = start.begin(job.program, job.lane, jax.jit(job.program.init)(job.lane))
+    assert _same(state.learner.actor, policy.actor)
+    assert _same(state.learner.target_actor, policy.actor)
+    assert int(state.statistics.count) == KNOWN_OBSERVATIONS
+    np.testing.assert_allclose(state.statistics.normaliser().scale, policy.normaliser.scale, 1e-6)
+    advance = jax.jit(job.program.advance)
+    acted = advance(job.lane, state, jnp.int32(0), jnp.int32(10))
+    rows = acted.replay.transitions.step
+    # Its statistics hardly move in ten steps, so that it acts as the policy does.
+    memory = policy.init()
+    for observation, action in zip(rows.observation[:10], rows.action[:10], strict=True):
+        expected, memory = policy.step(memory, observation)
+        np.testing.assert_allclose(action, expected, atol=0.1)
+    waiting = advance(job.lane, acted, jnp.int32(10), jnp.int32(40))
+    assert _same(waiting.learner.actor, policy.actor)
+    assert _same(waiting.learner.target_actor, policy.actor)
+    assert not _same(waiting.learner.target_critics, state.learner.target_critics)
+    later = advance(job.lane, waiting, jnp.int32(40), jnp.int32(44))
+    actor = {
+        layer: _same(policy.actor[layer], later.learner.actor[layer]) for layer in policy.actor
+    }
+    assert actor == {"current": False, "head": True, "output": False}
+    before, after = state.learner.critics[1], later.learner.critics[1]
+    critic = {layer: _same(before[layer], after[layer]) for layer in before}
+    assert critic == {"current": True, "head": False, "output": False}
+
+
+def test_a_whole_network_may_be_frozen():
+    before = Pair({"head": 1.0}, ({"head": 1.0}, {"head": 2.0}))
+    after = Pair({"head": 3.0}, ({"head": 4.0}, {"head": 5.0}))
+    assert frozen_parts(before, after, ["critics"]) == Pair(after.actor, before.critics)
+    assert frozen_parts(before, after, []) == after
+
+
+def test_a_checkpoint_gives_the_whole_learner(env, kept):
+    _, directory = kept
+    start = starts_of_path(directory, (1,))[1]
+    (job,) = make_jobs(env, _config(start="there"), [1], starts={1: start})
+    began = start.begin(job.program, job.lane, jax.eval_shape(job.program.init, job.lane))
+    whole = _checkpoint_state(directory, job)
+    assert _same(began.learner, whole.learner) and _same(began.statistics, whole.statistics)
+    assert int(began.learner.critic_optimizer.count) == 40
+    assert start.about == f"actor, critics and optimisers of {directory} seed 1"
+
+
+def _checkpoint_state(directory, job):
+    from rtd3jax.system.files import read_arrays
+    from rtd3jax.training.checkpoint import checkpoint_files, from_arrays
+
+    (file, *_) = checkpoint_files(directory / "seed-1")
+    return from_arrays(read_arrays(file)[0], job.program, job.lane, file)
+
+
+def test_each_seed_goes_on_from_its_own_and_with_others_the_same(env, kept):
+    run, directory = kept
+    other = rtd.make("rover", "ar1-slip")
+    both = rtd.train(other, _config(), [0, 1], progress=False, start=directory)
+    (alone,) = rtd.train(other, [_config()], [1], progress=False, start=directory)
+    assert _same(both.policy(1), alone.policy(1)) and not _same(both.policy(0), both.policy(1))
+    side = rtd.train(other, _config(), [0, 1], progress=False, start=directory, strategy="vmap")
+    np.testing.assert_allclose(side.returns, both.returns, rtol=1e-3)
+    fresh = rtd.train(other, _config(), [1], progress=False)
+    assert not _same(fresh.policy(1), alone.policy(1))
+    # A Run has the policies alone; its name is part of what checkpoints are of.
+    assert (
+        "a run of td3"
+        in rtd.train(other, _config(total_steps=22), [0, 1], progress=False, start=run).config.start
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (dict(algorithm="lstm-td3"), "has algorithm=td3, and the new"),
+        (dict(hidden_size=16), "has hidden_size=8, and the new training 16"),
+        (dict(normalise_observations=False), "has normalise_observations=True"),
+        (dict(freeze="actor.heart"), "actor has no layer 'heart'.*head.*its layers are"),
+        (dict(freeze="body"), "'body' is not actor or critics"),
+        (dict(start=3), "start must be a text"),
+    ],
+)
+@pytest.mark.parametrize("of", ["policy", "checkpoints"])
+def test_what_does_not_fit_is_refused_before_compilation(
+    env, kept, monkeypatch, of, changes, message
+):
+    from rtd3jax.training import lanes
+
+    run, directory = kept
+    monkeypatch.setattr(lanes, "_chunk", lambda *_: pytest.fail("compiled"))
+    start = run.policy(0) if of == "policy" else directory
+    with pytest.raises(rtd.UserError, match=message):
+        rtd.train(env, _config(**changes), [0], progress=False, start=start)
+
+
+def test_what_is_no_start_is_refused(env, kept, tmp_path):
+    _, directory = kept
+    for start, message in (
+        (3, "start must be a policy"),
+        (tmp_path / "nothing", "cannot be read"),
+        (tmp_path, "no saved policy, and has no checkpoint of seed 0"),
+    ):
+        with pytest.raises(rtd.UserError, match=message):
+            rtd.train(env, _config(), [0], progress=False, start=start)
+    with pytest.raises(rtd.UserError, match="no checkpoint of seed 7"):
+        rtd.train(env, _config(), [7], progress=False, start=directory)
+    pendulum = rtd.make("pendulum")
+    policy = random_policy("td3", env)
+    config = _config(normalise_observations=False)
+    with pytest.raises(rtd.UserError, match="2 observation and 2 action elements.*has 3 and 1"):
+        rtd.train(pendulum, config, [0], progress=False, start=policy)
+
+
+FLAGS = [
+    *("--env", "rover", "--algorithms", "td3", "--quiet"),
+    *("--no-report", "--final-episodes", "2", "--normalise-observations"),
+    *("--hidden-size=8", "--batch-size=4", "--learning-starts=20", "--eval-every=30"),
+    *("--eval-episodes=1", "--total-steps=60"),
+]
+
+
+def test_a_sweep_goes_on_from_another_and_says_so(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(references, "EPISODES", 2)
+    monkeypatch.setattr(finish, "refresh_page", lambda *_, **__: None)
+    monkeypatch.setattr(derive, "__kwdefaults__", {"pictures": False})
+    first, second = str(tmp_path / "first"), str(tmp_path / "second")
+    trained = [*FLAGS, "--disturbances", "sine-slip", "none", "--seeds", "1"]
+    assert sweep.main([*trained, "--out", first, "--keep-checkpoints"]) == 0
+    more = [*FLAGS, "--disturbances", "ar1-slip"]
+    for start, seeds, message in (
+        (first, 1, f"say which disturbance: {first}@sine-slip or {first}@none"),
+        (f"{first}@sine-slip", 2, "has no seed 1 to begin from"),
+        (f"{first}@ar1-slip", 1, "has no td3 under ar1-slip to begin from"),
+    ):
+        out = ["--out", second, "--start", start, "--seeds", str(seeds)]
+        assert sweep.main([*more, *out]) == 2
+        assert message in capsys.readouterr().err
+    assert not (tmp_path / "second").exists()  # nothing was begun
+    begun = [*more, "--start", f"{first}@sine-slip", "--seeds", "1"]
+    assert sweep.main([*begun, "--out", second, "--freeze", "actor.current"]) == 0
+    summary = (tmp_path / "second" / "summary.md").read_text()
+    assert f"began from: actor, critics and optimisers of {first} rover sine-slip" in summary
+    before, after = rtd.load_policy(first, disturbance="sine-slip"), rtd.load_policy(second)
+    assert _same(before.actor["current"], after.actor["current"])
+    assert not _same(before.actor["head"], after.actor["head"])
+    # Without checkpoints there is the actor alone.
+    shutil.rmtree(tmp_path / "first" / "checkpoints")
+    (cell,) = RunDirectory.open(second).cells
+    assert starts_of(cell, [0])[0].about == f"actor of {first} rover sine-slip"
+    # What is done needs its beginning no more.
+    shutil.rmtree(tmp_path / "first")
+    assert sweep.main([*begun, "--out", second, "--freeze", "actor.current"]) == 0
