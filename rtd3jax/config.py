@@ -97,7 +97,14 @@ class Config:
     )
     update_every: int = _field(
         1,
-        "environment steps per critic update (TD3: 1); with more, rewards' luck is fitted less",
+        "environment steps per critic update (TD3: 1); with more, rewards' luck is fitted less; "
+        "with fewer than environments, several updates follow each step of them",
+        low=1,
+    )
+    environments: int = _field(
+        1,
+        "environments that feed one learner side by side, each a transition a step; steps are "
+        "counted over all of them",
         low=1,
     )
     policy_delay: int = _field(2, "critic updates per actor and target update", low=1)
@@ -199,6 +206,7 @@ class Config:
             )
         if self.replay == "segments":
             self._check_segments()
+        self._check_environments(capacity)
         if self.actor_starts is None:
             object.__setattr__(self, "actor_starts", self.learning_starts)
         for name in ("start", "freeze"):
@@ -262,6 +270,27 @@ class Config:
         for name, value in resolved.items():
             object.__setattr__(self, name, value)
 
+    def _check_environments(self, capacity: int) -> None:
+        count = self.environments
+        if count == 1:
+            return
+        for name, value in (
+            ("total_steps", self.total_steps),
+            ("eval_every", self.eval_every),
+            ("replay_capacity", capacity),
+        ):
+            if value % count:
+                lower = max(count, value - value % count)
+                raise UserError(
+                    f"{name} ({value:,}) is not a multiple of environments ({count}), which step "
+                    f"together; {lower:,} would be"
+                )
+        if self.update_every % count and count % self.update_every:
+            raise UserError(
+                f"update_every ({self.update_every}) and environments ({count}): one must be a "
+                "multiple of the other, so that updates follow whole steps of all environments"
+            )
+
     def _check_segments(self) -> None:
         length = self.segment_steps
         if length < 1:
@@ -322,6 +351,27 @@ class Config:
     def frozen(self) -> tuple[str, ...]:
         """Parts of the networks whose weights stay as they began."""
         return tuple(part.strip() for part in self.freeze.split(",") if part.strip())
+
+    @property
+    def updates_per_round(self) -> int:
+        """Critic updates at once, after each `steps_per_round` steps of all environments."""
+        return max(1, self.environments // self.update_every)
+
+    @property
+    def steps_per_round(self) -> int:
+        """Steps of all environments between updates."""
+        return max(1, self.update_every // self.environments)
+
+    @property
+    def first_learning_step(self) -> int:
+        """The step of all environments from which on there are updates."""
+        return -(-self.learning_starts // self.environments)
+
+    @property
+    def updates(self) -> int:
+        """Critic updates until the end."""
+        steps = max(0, self.total_steps // self.environments - self.first_learning_step)
+        return -(-steps // self.steps_per_round) * self.updates_per_round
 
     @property
     def updates_before_the_actor(self) -> int:

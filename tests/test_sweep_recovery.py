@@ -14,6 +14,7 @@ import pytest
 
 from rtd3jax import sweep
 from rtd3jax.study import finish, recorder, references
+from rtd3jax.study.derive import derive
 from rtd3jax.study.log import LOG, read_log
 from rtd3jax.study.rundir import RunDirectory
 
@@ -206,7 +207,7 @@ def test_tables_wait_for_another_shards_tables(whole):
 
     directory = RunDirectory.open(whole)
     with deriver(whole):
-        thread = threading.Thread(target=directory.derive, args=([],), kwargs={"pictures": False})
+        thread = threading.Thread(target=derive, args=(directory, []), kwargs={"pictures": False})
         thread.start()
         time.sleep(0.3)
         assert thread.is_alive()

@@ -93,11 +93,17 @@ class Agent:
     def empty_replay(self) -> Replay:
         """The ring in which the agent's transitions are kept."""
         carry = self.acting.zero_carry(1) if self.stores_carry else None
-        return empty_replay(self.config.capacity, self.observation_size, self.action_size, carry)
+        return empty_replay(
+            self.config.capacity,
+            self.observation_size,
+            self.action_size,
+            carry,
+            self.config.environments,
+        )
 
     def zero_carry(self) -> Carry | None:
-        """The running carry, leaves [1, ...], before an episode's first step; None with windows."""
-        return self.acting.zero_carry(1) if self.has_running_carry else None
+        """The running carries, leaves [K, ...], before episodes' first steps; None with windows."""
+        return self.acting.zero_carry(self.config.environments) if self.has_running_carry else None
 
     def no_statistics(self) -> Statistics | None:
         """Those of no observation yet; None where networks read observations as they are."""

@@ -1,5 +1,8 @@
 """Histories: the tokens that an agent may read, cut from a ring of steps (paper, Section 5.1).
 
+A lane may have several environments, K of them, which act side by side: step s of environment e is
+step number ``s K + e``, so that the step before it is K numbers earlier.
+
 One function, `window_at`, serves acting, replay, evaluation and deployment. Its invariant: the
 tokens that exist are the last of the window. What is before an episode's first step, before the
 oldest step kept, or beyond the history length does not exist; it is not a zero token. `segment_at`
@@ -134,6 +137,11 @@ def put_row(ring: jax.Array, slot: jax.Array, row: jax.Array) -> jax.Array:
     return jax.lax.dynamic_update_index_in_dim(ring, row.astype(ring.dtype), slot, axis=0)
 
 
+def put_rows(ring: jax.Array, slot: jax.Array, rows: jax.Array) -> jax.Array:
+    """``ring`` [C, ...] with ``rows`` [K, ...] from ``slot`` on; in place under jit."""
+    return jax.lax.dynamic_update_slice_in_dim(ring, rows.astype(ring.dtype), slot, axis=0)
+
+
 def put_step(ring: Steps, step_number: jax.Array, step: Steps) -> Steps:
     """The ring after step ``step_number`` (int32 []), whose leaves are [O] and [A]."""
     slot = step_number % ring.action.shape[0]
@@ -149,6 +157,7 @@ def window_at(
     history_length: jax.Array | int,
     observation: jax.Array,
     previous_action: jax.Array,
+    environments: int = 1,
 ) -> Window:
     """What may be read at step ``step_number``.
 
@@ -161,14 +170,17 @@ def window_at(
         history_length: l <= L, past tokens that may be read.
         observation: [B, O], of the step.
         previous_action: [B, A], before it.
+        environments: K, how many act side by side.
     """
     capacity = ring.action.shape[0]
-    offset = jnp.arange(window_tokens, 0, -1, dtype=jnp.int32)
+    offset = environments * jnp.arange(window_tokens, 0, -1, dtype=jnp.int32)
     slots = (step_number[None, :] - offset[:, None]) % capacity
     past = jax.tree.map(lambda kept: kept[slots], ring)
     oldest = jnp.maximum(count - capacity, 0)
     length = _limited(
-        jnp.minimum(episode_step, step_number - oldest), window_tokens, history_length
+        jnp.minimum(episode_step, (step_number - oldest) // environments),
+        window_tokens,
+        history_length,
     )
     return Window(past, length, observation, previous_action)
 
@@ -182,8 +194,9 @@ def segment_at(
     length: int,
     history_length: jax.Array | int,
     burn_in_gradient: bool,
+    environments: int = 1,
 ) -> tuple[Segment, jax.Array]:
-    """Steps ``first`` to ``first + m - 1`` with the burn-in before them, and their slots [m, M].
+    """The m steps of an environment from ``first`` on, the burn-in before, and their slots [m, M].
 
     Args:
         ring: the steps.
@@ -194,14 +207,17 @@ def segment_at(
         length: m.
         history_length: l <= L, tokens of the burn-in that may be read.
         burn_in_gradient: see `Segment`.
+        environments: K, how many act side by side.
     """
     capacity = episode_steps.shape[0]
     offset = jnp.arange(-window_tokens, length, dtype=jnp.int32)
-    step_number = first[None, :] + offset[:, None]
+    step_number = first[None, :] + environments * offset[:, None]
     slots = step_number % capacity
     oldest = jnp.maximum(count - capacity, 0)
     starts = (
-        (episode_steps[slots] == 0) | (step_number == oldest) | (offset == -history_length)[:, None]
+        (episode_steps[slots] == 0)
+        | (step_number // environments == oldest // environments)
+        | (offset == -history_length)[:, None]
     )
     steps = jax.tree.map(lambda kept: kept[slots], ring)
     segment = Segment(

@@ -53,14 +53,18 @@ class Statistics:
     mean: jax.Array
     variance: jax.Array
 
-    def note(self, observation: jax.Array) -> "Statistics":
-        """The statistics with one more ``observation`` [O] (Welford, 1962)."""
-        count = self.count + jnp.int32(1)
-        share = 1.0 / count.astype(jnp.float32)
-        change = observation - self.mean
+    def note(self, observations: jax.Array) -> "Statistics":
+        """The statistics with K more ``observations`` [K, O] (Welford, 1962; Chan et al., 1983)."""
+        number = observations.shape[0]
+        count = self.count + jnp.int32(number)
+        share = number / count.astype(jnp.float32)
+        centre = jnp.mean(observations, axis=0)
+        within = jnp.mean(jnp.square(observations - centre[None, :]), axis=0)
+        change = centre - self.mean
         mean = self.mean + share * change
         # The mean of squares, not their sum: it does not grow, so float32 goes on resolving it.
-        variance = self.variance + share * (change * (observation - mean) - self.variance)
+        between = (1.0 - share) * jnp.square(change)
+        variance = self.variance + share * (within + between - self.variance)
         return Statistics(count, mean, variance)
 
     def normaliser(self) -> Normaliser:

@@ -1,7 +1,8 @@
 """A lane's replay: a ring of transitions, and batches of windows cut from it.
 
-Every environment step writes one row, so a row's number is the lane's step and the ring needs no
-counter of its own. Where an agent's critics start from the behaviour actor's carries (h-td3), the
+Every environment step writes one row, so a row's number follows from the lane's step and the ring
+needs no counter of its own: of K environments side by side, environment e writes row ``s K + e`` at
+the lane's step s. Where an agent's critics start from the behaviour actor's carries (h-td3), the
 ring keeps these too; what that asks of the order of reads and writes is dealt with here alone.
 Shapes: ``C`` capacity, ``B`` batch, ``H`` width.
 """
@@ -22,6 +23,7 @@ from rtd3jax.agents.history import (
     flat,
     next_window,
     put_row,
+    put_rows,
     put_step,
     segment_at,
     window_at,
@@ -55,14 +57,16 @@ class Replay:
 
     Attributes:
         transitions: leaves [C, ...].
-        carries: None, or leaves [C + 1, ...]: slot n % (C + 1) holds the behaviour actor's carry
+        carries: None, or leaves [C + K, ...]: slot n % (C + K) holds the behaviour actor's carry
             before step n's current token, that is the carry *of* row n and the *next* carry of row
-            n - 1. An episode's first step has no past, so its carry is zero and its slot is free
+            n - K. An episode's first step has no past, so its carry is zero and its slot is free
             for the carry that belongs to the final observation of the episode before.
+        environments: K; it divides C.
     """
 
     transitions: Transition
     carries: Carry | None
+    environments: int = struct.field(pytree_node=False, default=1)
 
 
 @struct.dataclass
@@ -88,7 +92,11 @@ class Batch:
 
 
 def empty_replay(
-    capacity: int, observation_size: int, action_size: int, carry: Carry | None
+    capacity: int,
+    observation_size: int,
+    action_size: int,
+    carry: Carry | None,
+    environments: int = 1,
 ) -> Replay:
     """A ring of ``capacity`` rows; with carries like ``carry`` (leaves [1, ...]), unless None."""
     transitions = Transition(
@@ -99,9 +107,9 @@ def empty_replay(
         episode_step=jnp.zeros((capacity,), jnp.int32),
     )
     carries = jax.tree.map(
-        lambda leaf: jnp.zeros((capacity + 1, *leaf.shape[1:]), jnp.float32), carry
+        lambda leaf: jnp.zeros((capacity + environments, *leaf.shape[1:]), jnp.float32), carry
     )
-    return Replay(transitions, carries)
+    return Replay(transitions, carries, environments)
 
 
 def present_window(
@@ -113,26 +121,28 @@ def present_window(
     window_tokens: int,
     history_length: jax.Array | int,
 ) -> Window:
-    """The window of step ``step`` (int32 []), which is not written yet: a batch of one.
+    """The windows of the lane's step ``step`` (int32 []), which is not written yet: a batch of K.
 
     Args:
         replay: the ring, with all steps before.
         step: the step's number.
-        episode_step: int32 [], steps of the same episode before it.
-        observation: [O], seen at it.
-        previous_action: [A], before it.
+        episode_step: int32 [K], steps of the same episode before it.
+        observation: [K, O], seen at it.
+        previous_action: [K, A], before it.
         window_tokens: L, past tokens in the window's arrays.
         history_length: l <= L, past tokens that may be read.
     """
+    count = step * replay.environments
     return window_at(
         replay.transitions.step,
-        step[None],
-        episode_step[None],
-        step,
+        count + jnp.arange(replay.environments, dtype=jnp.int32),
+        episode_step,
+        count,
         window_tokens,
         history_length,
-        observation[None],
-        previous_action[None],
+        observation,
+        previous_action,
+        replay.environments,
     )
 
 
@@ -162,23 +172,26 @@ def put_carry(replay: Replay, step_number: jax.Array, carry: Carry) -> Replay:
 def keep_acting_carry(
     replay: Replay, step: jax.Array, episode_step: jax.Array, carry: Carry | None
 ) -> Replay:
-    """Keep the carry (leaves [1, ...]) with which step ``step`` acts; before it is learned from.
+    """Keep the carries (leaves [K, ...]) with which step ``step`` acts; before it is learned from.
 
     Not an episode's first one: its slot holds the carry of the last episode's final observation.
     """
     if replay.carries is None:
         return replay
-    slot = _carry_slot(replay.carries, step)
-    row = jax.tree.map(
-        lambda kept, new: jnp.where(episode_step == 0, kept[slot], new[0]), replay.carries, carry
-    )
-    return put_carry(replay, step, row)
+    slot = _carry_slot(replay.carries, step * replay.environments)
+
+    def rows(kept: jax.Array, new: jax.Array) -> jax.Array:
+        there = jax.lax.dynamic_slice_in_dim(kept, slot, replay.environments, axis=0)
+        first = (episode_step == 0).reshape(-1, *[1] * (new.ndim - 1))
+        return jnp.where(first, there, new)
+
+    return _put_carries(replay, slot, jax.tree.map(rows, replay.carries, carry))
 
 
 def store(
     replay: Replay,
     step: jax.Array,
-    row: Transition,
+    rows: Transition,
     done: jax.Array,
     final_carry: Callable[[], Carry],
     never: jax.Array,
@@ -188,25 +201,35 @@ def store(
     Args:
         replay: the ring.
         step: int32 [].
-        row: the transition.
-        done: bool [], whether the episode ended with it.
-        final_carry: gives the behaviour actor's carry, leaves [1, ...], before the final
-            observation; called where the ring keeps carries.
+        rows: the K environments' transitions, leaves [K, ...].
+        done: bool [K], whether an episode ended with it.
+        final_carry: gives the behaviour actor's carries, leaves [K, ...], before the final
+            observations; called where the ring keeps carries.
         never: bool [], false, computed from what the updates read; see `_after`.
     """
-    step = _after(step, never)
-    replay = put_transition(replay, step, row)
+    first = _after(step, never) * replay.environments
+    kept = replay.transitions
+    slot = first % kept.reward.shape[0]
+    written = jax.tree.map(lambda ring, new: put_rows(ring, slot, new), kept, rows)
+    replay = dataclasses.replace(replay, transitions=written)
     if replay.carries is None:
         return replay
     # Within an episode the next step's own carry takes this slot.
     carry = jax.lax.cond(
-        done,
+        jnp.any(done),
         final_carry,
         lambda: jax.tree.map(
-            lambda kept: jnp.zeros((1, *kept.shape[1:]), kept.dtype), replay.carries
+            lambda kept: jnp.zeros((replay.environments, *kept.shape[1:]), kept.dtype),
+            replay.carries,
         ),
     )
-    return put_carry(replay, step + 1, jax.tree.map(lambda leaf: leaf[0], carry))
+    slot = _carry_slot(replay.carries, first + replay.environments)
+    return _put_carries(replay, slot, carry)
+
+
+def _put_carries(replay: Replay, slot: jax.Array, rows: Carry) -> Replay:
+    carries = jax.tree.map(lambda kept, new: put_rows(kept, slot, new), replay.carries, rows)
+    return dataclasses.replace(replay, carries=carries)
 
 
 @jax.custom_batching.custom_vmap
@@ -271,6 +294,7 @@ def gather(
         history_length,
         kept.step.observation[slot],
         kept.step.previous_action[slot],
+        replay.environments,
     )
     action = kept.step.action[slot]
     carry, next_carry = _stored_carries(replay, step_number, episode_step)
@@ -314,7 +338,8 @@ def sample_segments(
         actor_goes_on: whether its segments begin with those carries, from which the actor goes on.
     """
     oldest = jnp.maximum(count - replay.transitions.reward.shape[0], 0)
-    first = jax.random.randint(key, (batch_size // length,), oldest, count - length + 1, jnp.int32)
+    last = count - (length - 1) * replay.environments
+    first = jax.random.randint(key, (batch_size // length,), oldest, last, jnp.int32)
     rows = replay, first, count, window_tokens, history_length, length, burn_in_gradient
     return gather_segments(
         *rows, critic_reads_carries=critic_reads_carries, actor_goes_on=actor_goes_on
@@ -347,15 +372,18 @@ def gather_segments(
         length,
         history_length,
         burn_in_gradient,
+        replay.environments,
     )
     slot, action = slots.reshape(-1), segment.action
-    step_number = flat(first[None, :] + jnp.arange(length, dtype=jnp.int32)[:, None])
+    step_number = flat(
+        first[None, :] + replay.environments * jnp.arange(length, dtype=jnp.int32)[:, None]
+    )
     carry = next_carry = None
     if critic_reads_carries:
         carry, next_carry = _stored_carries(replay, step_number, kept.episode_step[slot])
     if actor_goes_on and replay.carries is not None:
         segment = dataclasses.replace(
-            segment, start=_carry_at(replay.carries, first - window_tokens)
+            segment, start=_carry_at(replay.carries, first - replay.environments * window_tokens)
         )
     following = dataclasses.replace(
         segment,
@@ -386,7 +414,7 @@ def _stored_carries(
         ),
         _carry_at(replay.carries, step_number),
     )
-    return carry, _carry_at(replay.carries, step_number + 1)
+    return carry, _carry_at(replay.carries, step_number + replay.environments)
 
 
 def _carry_at(carries: Carry, step_number: jax.Array) -> Carry:

@@ -112,22 +112,23 @@ def _timed(
         return time.perf_counter() - began
 
     # Rows of zeros take as long as what an environment gave. Steps are a whole number of updates.
-    start = config.learning_starts
-    block = config.update_every * config.policy_delay
+    together_at = config.environments  # steps are those of all environments
+    start = config.first_learning_step * together_at
+    block = max(config.update_every, together_at) * config.policy_delay
     seconds(start, start + block)
     together.wait()
     done, spent = 0, 0.0
     while spent < _SECONDS:
         # Between two evaluations, which are timed by themselves.
         first = start + (-start) % config.eval_every
-        length = min(block, max(1, config.eval_every - 1))
+        length = min(block, max(together_at, config.eval_every - together_at))
         spent += seconds(first, first + length)
         done += length
         block *= 2
     step = spent / done
-    last = config.eval_every - 1
-    both = seconds(last, last + 1)
-    return step, max(0.0, both - step)
+    last = config.eval_every - together_at
+    both = seconds(last, config.eval_every)
+    return step, max(0.0, both - together_at * step)
 
 
 def _filled_in(

@@ -24,8 +24,9 @@ def add_starts(directory: RunDirectory, jobs: Sequence[Job], *, write: bool) -> 
     """
     by_cell: dict[Cell, list[Job]] = {}
     for job in jobs:
-        begun = checkpoint_files(directory.lanes.checkpoint_directory(*job.key))
-        if job.cell.config.start and not begun and not directory.lanes.is_done(*job.key):
+        if not job.cell.config.start or directory.lanes.is_done(*job.key):
+            continue
+        if not checkpoint_files(directory.lanes.checkpoint_directory(*job.key)):
             by_cell.setdefault(job.cell, []).append(job)
     for cell, own in by_cell.items():
         starts = starts_of(cell, [job.seed for job in own])

@@ -305,6 +305,8 @@ def _chunk(group: Group, device: jax.Device, rates: dict[Any, float]) -> None:
     stop = min(group.step + steps, group.total)
     if group.step < warm_up:
         stop = min(warm_up, group.total)
+    environments = program.config.environments
+    stop = -(-stop // environments) * environments  # they step together
     began = time.perf_counter()
     state = advance(lane, state, jnp.int32(group.step), jnp.int32(stop))
     jax.block_until_ready(state)

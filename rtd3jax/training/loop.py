@@ -66,17 +66,18 @@ class Lane:
 
 @struct.dataclass
 class LaneState:
-    """Everything that a lane is between two steps. ``K`` evaluations.
+    """Everything that a lane is between two steps. ``K`` evaluations, ``E`` environments.
 
     Attributes:
         learner: networks and optimisers, as the agent's learner keeps them.
         replay: what was seen.
         statistics: of the observations seen, where networks read them normalised; else None.
-        env_state: the environment's own.
-        observation: [O], the one to act upon.
-        previous_action: [A], in half ranges as all actions of an agent; zero at an episode's start.
-        episode_step: int32 [], steps done in the episode.
-        carry: the actor's, leaves [1, ...], where it runs on from the episode's start; else None.
+        env_state: the environments' own; of several with a leading axis.
+        observation: [E, O], those to act upon.
+        previous_action: [E, A], in half ranges as all actions of an agent; zero at an episode's
+            start.
+        episode_step: int32 [E], steps done in the episode.
+        carry: the actor's, leaves [E, ...], where it runs on from the episode's start; else None.
         returns: [K], mean return of each evaluation so far.
         true_returns: [K], the same of the undisturbed state's reward.
         metrics: of learning, averaged over each interval between evaluations.
@@ -143,29 +144,34 @@ class Program:
     def init(self, lane: Lane) -> LaneState:
         """The lane before its first step."""
         key = jax.random.key(lane.seed)
-        with foreign_code():
-            observation, env_state = self.env.reset(
-                jax.random.fold_in(key, _RESET), lane.env_params
-            )
+        observation, env_state = self._reset(jax.random.fold_in(key, _RESET), lane)
+        count = self.config.environments
         return LaneState(
             learner=self.agent.init(jax.random.fold_in(key, _INIT)),
             replay=self.agent.empty_replay(),
             statistics=self.agent.no_statistics(),
             env_state=env_state,
             observation=observation.astype(jnp.float32),
-            previous_action=jnp.zeros((self.action_size,), jnp.float32),
-            episode_step=jnp.int32(0),
+            previous_action=jnp.zeros((count, self.action_size), jnp.float32),
+            episode_step=jnp.zeros((count,), jnp.int32),
             carry=self.agent.zero_carry(),
             returns=jnp.full((self.evaluations,), jnp.nan, jnp.float32),
             true_returns=jnp.full((self.evaluations,), jnp.nan, jnp.float32),
-            metrics=empty_averages(self.agent.metrics, self.evaluations),
+            metrics=empty_averages(self.agent.metrics, self.evaluations, count),
             failure=jnp.int32(HEALTHY),
             failed_at=jnp.int32(-1),
         )
 
     def advance(self, lane: Lane, state: LaneState, start: jax.Array, stop: jax.Array) -> LaneState:
-        """The lane after steps ``start`` to ``stop - 1`` (int32 []), however they are cut."""
-        return lax.fori_loop(start, stop, lambda step, s: self._step(lane, s, step), state)
+        """The lane after steps ``start`` to ``stop - 1`` (int32 []), however they are cut.
+
+        Steps are those of environments, of which several are done at once where there are several:
+        ``start`` and ``stop`` are multiples of their number.
+        """
+        count = self.config.environments
+        return lax.fori_loop(
+            start // count, stop // count, lambda step, s: self._step(lane, s, step), state
+        )
 
     def policy(self, lane: Lane, state: LaneState) -> Policy:
         """The deterministic policy that the lane has learned."""
@@ -210,19 +216,17 @@ class Program:
         window = normalised(present, normaliser)
         greedy, kept = self.agent.act(state.learner.actor, window, state.carry)
         action = self._explore(greedy, act_key, hyperparameters, step)
-        carry = self.agent.carry_after(state.learner.actor, window, action[None], state.carry)
+        carry = self.agent.carry_after(state.learner.actor, window, action, state.carry)
         replay = keep_acting_carry(state.replay, step, state.episode_step, kept)
 
         learner, metrics, loss = self._learn(
             state.learner, replay, normaliser, state.metrics, learn_key, hyperparameters, step
         )
 
-        command = self.bounds(lane).to_environment(action).reshape(self.action_shape)
-        with foreign_code():
-            observation, env_state, reward, terminated, truncated, info = self.env.step(
-                env_key, state.env_state, command, lane.env_params
-            )
-        final_observation = info["final_observation"].astype(jnp.float32)
+        observation, env_state, reward, terminated, truncated, final_observation = self._transit(
+            env_key, state.env_state, action, lane
+        )
+        final_observation = final_observation.astype(jnp.float32)
         reward = reward.astype(jnp.float32)
         done = terminated.astype(bool) | truncated.astype(bool)
 
@@ -240,15 +244,15 @@ class Program:
             final_carry=lambda: self.agent.final_carry(
                 learner.actor,
                 window,
-                action[None],
-                as_read(final_observation[None], normaliser),
+                action,
+                as_read(final_observation, normaliser),
                 hyperparameters.history_length,
                 carry,
             ),
             # Losses are not negative, and actions not above one.
             never=(loss < 0.0) & jnp.all(action > 1.0),
         )
-        finite = jnp.all(jnp.isfinite(final_observation)) & jnp.isfinite(reward)
+        finite = jnp.all(jnp.isfinite(final_observation)) & jnp.all(jnp.isfinite(reward))
         state = dataclasses.replace(
             state,
             learner=learner,
@@ -256,28 +260,64 @@ class Program:
             statistics=statistics,
             env_state=env_state,
             observation=observation.astype(jnp.float32),
-            previous_action=jnp.where(done, 0.0, action),
+            previous_action=jnp.where(done[:, None], 0.0, action),
             episode_step=jnp.where(done, 0, state.episode_step + 1).astype(jnp.int32),
-            carry=jax.tree.map(lambda part: jnp.where(done, 0.0, part), carry),
+            carry=jax.tree.map(
+                lambda part: jnp.where(done.reshape(-1, *[1] * (part.ndim - 1)), 0.0, part), carry
+            ),
             metrics=note_reward(metrics, reward, done),
         )
-        state = _note_failure(state, step, ~finite, ENVIRONMENT_NOT_FINITE)
-        state = _note_failure(state, step, ~jnp.isfinite(loss), LOSS_NOT_FINITE)
-        return self._evaluate(lane, state, step + 1)
+        at = step * self.config.environments
+        state = _note_failure(state, at, ~finite, ENVIRONMENT_NOT_FINITE)
+        state = _note_failure(state, at, ~jnp.isfinite(loss), LOSS_NOT_FINITE)
+        return self._evaluate(lane, state, (step + 1) * self.config.environments)
+
+    def _reset(self, key: jax.Array, lane: Lane) -> tuple[jax.Array, Any]:
+        """The environments' first observations [E, O], and their state."""
+        with foreign_code():
+            if self.config.environments == 1:
+                observation, env_state = self.env.reset(key, lane.env_params)
+                return observation[None], env_state
+            keys = jax.random.split(key, self.config.environments)
+            return jax.vmap(self.env.reset, (0, None))(keys, lane.env_params)
+
+    def _transit(
+        self, key: jax.Array, env_state: Any, action: jax.Array, lane: Lane
+    ) -> tuple[jax.Array, Any, jax.Array, jax.Array, jax.Array, jax.Array]:
+        """A step of each environment with its ``action`` [E, A].
+
+        Returns:
+            The next observations [E, O], the state, rewards, terminations and truncations [E], and
+            the observations that the actions led to [E, O], where an episode ended its final one.
+        """
+        bounds = self.bounds(lane)
+
+        def step(key: jax.Array, env_state: Any, action: jax.Array) -> tuple[Any, ...]:
+            command = bounds.to_environment(action).reshape(self.action_shape)
+            *found, info = self.env.step(key, env_state, command, lane.env_params)
+            return *found, info["final_observation"]
+
+        with foreign_code():
+            if self.config.environments == 1:
+                observation, env_state, *rest = step(key, env_state, action[0])
+                return observation[None], env_state, *(leaf[None] for leaf in rest)
+            keys = jax.random.split(key, self.config.environments)
+            return jax.vmap(step)(keys, env_state, action)
 
     def _explore(
         self, greedy: jax.Array, key: jax.Array, hyperparameters: Hyperparameters, step: jax.Array
     ) -> jax.Array:
-        """Uniform before learning starts, then the agent's action [1, A] with noise: [A].
+        """Uniform before learning starts, then the agent's actions [E, A] with noise: [E, A].
 
         A lane that goes on from a trained policy acts by it from its first step.
         """
         uniform_key, noise_key = jax.random.split(key)
-        noisy = add_noise(noise_key, greedy, hyperparameters.exploration_noise)[0]
+        noisy = add_noise(noise_key, greedy, hyperparameters.exploration_noise)
         if self.config.start:  # it can act already
             return noisy
         uniform = jax.random.uniform(uniform_key, noisy.shape, jnp.float32, -1.0, 1.0)
-        return jnp.where(step < self.config.learning_starts, uniform, noisy)
+        starts = self.config.learning_starts
+        return jnp.where(step * self.config.environments < starts, uniform, noisy)
 
     def _learn(
         self,
@@ -289,20 +329,34 @@ class Program:
         hyperparameters: Hyperparameters,
         step: jax.Array,
     ) -> tuple[Any, Averages, jax.Array]:
-        """The step's update, if it has one; its critics' loss [], 0 without one."""
+        """The step's updates, if it has some; their critics' loss [], 0 without one."""
         config = self.config
-        keys = jax.random.split(key, 3)
-        since = step - config.learning_starts
-        due = (since >= 0) & (since % config.update_every == 0)
-        count = since // config.update_every + 1
-        hyperparameters = hyperparameters.decayed(step.astype(jnp.float32) / config.total_steps)
+        count = step * config.environments
+        hyperparameters = hyperparameters.decayed(count.astype(jnp.float32) / config.total_steps)
+        since = step - config.first_learning_step
+        due = (since >= 0) & (since % config.steps_per_round == 0)
+        done = (since // config.steps_per_round) * config.updates_per_round
+
+        def update(
+            learner: Any, metrics: Averages, keys: jax.Array, number: jax.Array
+        ) -> tuple[Any, Averages, jax.Array]:
+            history_length = hyperparameters.history_length
+            batch = self.agent.sample(replay, keys[0], count, history_length, normaliser)
+            learner, found = self.agent.update(learner, batch, keys[1:], hyperparameters, number)
+            return learner, note_update(metrics, found), found["critic_loss"].total
 
         def learn(learner: Any, metrics: Averages) -> tuple[Any, Averages, jax.Array]:
-            batch = self.agent.sample(
-                replay, keys[0], step, hyperparameters.history_length, normaliser
-            )
-            learner, found = self.agent.update(learner, batch, keys[1:], hyperparameters, count)
-            return learner, note_update(metrics, found), found["critic_loss"].total
+            if config.updates_per_round == 1:
+                return update(learner, metrics, jax.random.split(key, 3), done + 1)
+
+            def another(index: jax.Array, so_far: tuple[Any, Averages, jax.Array]):
+                learner, metrics, total = so_far
+                keys = jax.random.split(jax.random.fold_in(key, index), 3)
+                learner, metrics, loss = update(learner, metrics, keys, done + index + 1)
+                return learner, metrics, total + loss
+
+            first = learner, metrics, jnp.float32(0.0)
+            return lax.fori_loop(0, config.updates_per_round, another, first)
 
         def wait(learner: Any, metrics: Averages) -> tuple[Any, Averages, jax.Array]:
             return learner, metrics, jnp.float32(0.0)

@@ -22,7 +22,7 @@ class Averages:
     Attributes:
         totals: float32 [M], of what was measured in this interval.
         counts: float32 [M], how often.
-        episode_return: float32 [], of the episode under way.
+        episode_return: float32 [E], of each environment's episode under way.
         curves: float32 [K, M], averages; NaN where nothing was measured.
         names: of the metrics.
     """
@@ -39,12 +39,13 @@ def metric_names(learner: tuple[str, ...]) -> tuple[str, ...]:
     return (*learner, EXPLORATION_RETURN)
 
 
-def empty_averages(learner: tuple[str, ...], evaluations: int) -> Averages:
+def empty_averages(learner: tuple[str, ...], evaluations: int, environments: int) -> Averages:
     """Before the first step, for a learner that measures ``learner``."""
     names = metric_names(learner)
     zeros = jnp.zeros((len(names),), jnp.float32)
     curves = jnp.full((evaluations, len(names)), jnp.nan, jnp.float32)
-    return Averages(zeros, zeros.copy(), jnp.float32(0.0), curves, names)
+    returns = jnp.zeros((environments,), jnp.float32)
+    return Averages(zeros, zeros.copy(), returns, curves, names)
 
 
 def note_update(averages: Averages, found: Metrics) -> Averages:
@@ -61,14 +62,14 @@ def note_update(averages: Averages, found: Metrics) -> Averages:
 
 
 def note_reward(averages: Averages, reward: jax.Array, done: jax.Array) -> Averages:
-    """With a step's ``reward`` []; ``done`` bool [], whether its episode ended with it."""
+    """With a step's ``reward`` [E]; ``done`` bool [E], whether its episode ended with it."""
     total = averages.episode_return + reward
     last = jnp.arange(len(averages.names), dtype=jnp.int32) == len(averages.names) - 1
-    ended = last & done
+    ended, count = jnp.sum(jnp.where(done, total, 0.0)), jnp.sum(done).astype(jnp.float32)
     return dataclasses.replace(
         averages,
-        totals=averages.totals + jnp.where(ended, total, 0.0),
-        counts=averages.counts + ended.astype(jnp.float32),
+        totals=averages.totals + jnp.where(last, ended, 0.0),
+        counts=averages.counts + jnp.where(last, count, 0.0),
         episode_return=jnp.where(done, 0.0, total),
     )
 

@@ -15,9 +15,7 @@ _ZERO = {
 
 def updates_of(config: Config) -> tuple[int, int]:
     """How often the critics and the actor will be updated."""
-    steps = max(0, config.total_steps - config.learning_starts)
-    critics = -(-steps // config.update_every)
-    return critics, critics // config.policy_delay
+    return config.updates, config.updates // config.policy_delay
 
 
 def why_untrained(config: Config) -> str | None:

@@ -16,7 +16,7 @@ from rtd3jax.training.run import make_jobs
 
 def _statistics(rows):
     def note(statistics, row):
-        return statistics.note(row), None
+        return statistics.note(row[None]), None
 
     return jax.lax.scan(note, no_statistics(rows.shape[1]), jnp.asarray(rows, jnp.float32))[0]
 

@@ -216,7 +216,7 @@ def test_actions_in_the_environments_units_are_within_its_bounds():
 def test_learning_rates_fall_linearly_to_their_final_fraction():
     numbers = _numbers()
     for progress, share in ((0.0, 1.0), (0.5, 0.625), (1.0, 0.25)):
-        now = numbers.at(jnp.float32(progress))
+        now = numbers.decayed(jnp.float32(progress))
         np.testing.assert_allclose(now.actor_learning_rate, 1e-2 * share, rtol=1e-6)
         np.testing.assert_allclose(now.critic_learning_rate, 2e-2 * share, rtol=1e-6)
     assert float(now.gamma) == float(numbers.gamma)

@@ -12,18 +12,18 @@ from rtd3jax.training.metrics import averaged, empty_averages, note_reward, note
 
 
 def test_averages_are_over_what_was_measured_in_the_interval():
-    averages = empty_averages(("critic_loss", "actor_loss"), 3)
+    averages = empty_averages(("critic_loss", "actor_loss"), 3, 1)
     nothing = Measured(jnp.float32(0), jnp.float32(0))
     for loss, actor in ((2.0, None), (4.0, -1.0), (9.0, None)):
         found = nothing if actor is None else Measured(jnp.float32(actor), jnp.float32(1))
         critic = Measured(jnp.float32(loss), jnp.float32(1))
         averages = note_update(averages, {"critic_loss": critic, "actor_loss": found})
     for reward, done in ((1.0, False), (2.0, True), (5.0, False)):
-        averages = note_reward(averages, jnp.float32(reward), jnp.asarray(done))
+        averages = note_reward(averages, jnp.float32([reward]), jnp.asarray([done]))
     averages = averaged(averages, jnp.int32(0))
     np.testing.assert_array_equal(averages.curves[0], [5.0, -1.0, 3.0])
     # An episode that is under way counts where it ends; an interval without measurements has none.
-    averages = note_reward(averages, jnp.float32(1.0), jnp.asarray(True))
+    averages = note_reward(averages, jnp.float32([1.0]), jnp.asarray([True]))
     averages = averaged(averages, jnp.int32(1))
     np.testing.assert_array_equal(averages.curves[1], [np.nan, np.nan, 6.0])
     assert np.isnan(averages.curves[2]).all()
