@@ -2,10 +2,17 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
+from rtd3jax.agents.memory.base import Params
 from rtd3jax.agents.networks import Network
 from rtd3jax.errors import UserError, nearest
+
+State = TypeVar("State")
+"""What a learner keeps: a dataclass of networks, optimisers and the like."""
+
+Weights = Params | tuple[Params, ...]
+"""Of one network, or of several alike."""
 
 
 def check_parts(parts: Sequence[str], networks: Mapping[str, Network]) -> None:
@@ -23,18 +30,24 @@ def check_parts(parts: Sequence[str], networks: Mapping[str, Network]) -> None:
 LAYERS = ("encoder", "memory", "current", "head", "output")
 
 
-def frozen_parts(before: Any, after: Any, parts: Sequence[str]) -> Any:
+def frozen_parts(before: State, after: State, parts: Sequence[str]) -> State:
     """The learner's state ``after`` an update, with ``parts`` as they were ``before`` it."""
+    if not parts:
+        return after
+    kept: dict[str, Weights] = {}
     for part in parts:
         whose, _, layer = part.partition(".")
-        kept = _kept(getattr(before, whose), getattr(after, whose), layer)
-        after = dataclasses.replace(after, **{whose: kept})
-    return after
+        kept[whose] = _kept(getattr(before, whose), kept.get(whose, getattr(after, whose)), layer)
+    changed: Any = after
+    return dataclasses.replace(changed, **kept)
 
 
-def _kept(before: Any, after: Any, layer: str) -> Any:
+def _kept(before: Weights, after: Weights, layer: str) -> Weights:
     if not layer:
         return before
-    if isinstance(after, dict):
-        return {**after, layer: before[layer]}
-    return tuple(_kept(*pair, layer) for pair in zip(before, after, strict=True))
+    if isinstance(before, tuple):
+        assert isinstance(after, tuple)
+        pairs = zip(before, after, strict=True)
+        return tuple({**new, layer: old[layer]} for old, new in pairs)
+    assert isinstance(after, dict)
+    return {**after, layer: before[layer]}

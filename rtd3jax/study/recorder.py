@@ -2,7 +2,6 @@
 
 import json
 import time
-from typing import Any
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from rtd3jax.study.plan import label
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.lanes import Group, Job
-from rtd3jax.training.loop import HEALTHY
+from rtd3jax.training.loop import HEALTHY, LaneState
 from rtd3jax.training.run import curves_of, evaluation_steps, failure_of, metric_curves
 
 
@@ -95,7 +94,7 @@ class Recorder:
                         self._logger.log(cell, seed, row)
                 self._logged[id(job)] = reached
 
-    def _keep(self, job: Job, state: Any) -> None:
+    def _keep(self, job: Job, state: LaneState) -> None:
         cell, seed = job.key
         failure = failure_of(seed, state)
         returns, true_returns = curves_of(cell.config, state, failure)
