@@ -56,6 +56,8 @@ def test_the_rover_experiment_runs_and_says_what_is_missing(tmp_path, capsys):
         pytest.param("filter_reference", marks=pytest.mark.slow),
         pytest.param("memories", marks=pytest.mark.slow),
         pytest.param("segments_returns", marks=pytest.mark.slow),
+        pytest.param("many_environments", marks=pytest.mark.slow),
+        pytest.param("fine_tuning", marks=pytest.mark.slow),
     ],
 )
 def test_small_experiments_run(name, tmp_path):

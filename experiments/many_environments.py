@@ -1,0 +1,98 @@
+"""Sixteen environments or one, at equal transitions and updates: returns and time, on the rover.
+
+Usage: python experiments/many_environments.py [--quick] [--seeds N] [--out DIR]
+
+`lstm-td3-1ha1hc` under AR(1) slip with the setting of the preset `rover`, five paired seeds, tested
+on 1,000 episodes each. Both ways are trained in turns, seed by seed, so that what else the machine
+does meets both. Writes many_environments.md, .parquet and .json.
+"""
+
+import argparse
+import pathlib
+import sys
+import time
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+import rtd3jax as rtd
+from rtd3jax.study.presets import ROVER_HISTORY_LENGTH, ROVER_SETTINGS, ROVER_STEPS
+
+sys.path.insert(0, str(pathlib.Path(__file__).parent))
+from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
+
+AGENT, DISTURBANCE, COUNTS, EPISODES, SEEDS = "lstm-td3-1ha1hc", "ar1-slip", (1, 16), 1_000, 5
+
+
+def trained(count: int, seed: int, episodes: int, tiny: dict[str, object]) -> dict[str, object]:
+    """Train and test one lane of ``count`` environments."""
+    env = rtd.make("rover", DISTURBANCE)
+    fields = {**ROVER_SETTINGS, "total_steps": ROVER_STEPS, **tiny, "environments": count}
+    config = rtd.Config(AGENT, ROVER_HISTORY_LENGTH, **fields)
+    began = time.perf_counter()
+    run = rtd.train(env, config, [seed], progress=False)
+    seconds = time.perf_counter() - began
+    returns = rtd.evaluate(run.policy(seed), env, episodes, seed=seed)
+    return {
+        "environments": count,
+        "seed": seed,
+        "mean": float(np.mean(returns)),
+        "seconds": seconds,
+        "updates": config.updates,
+    }
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
+    parser.add_argument("--seeds", type=int, default=SEEDS)
+    parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
+    options = parser.parse_args(arguments)
+    tiny, episodes = {}, EPISODES
+    if options.quick:
+        tiny = {"total_steps": 160, "hidden_size": 4, "batch_size": 4, "learning_starts": 16}
+        tiny |= {"eval_every": 160, "eval_episodes": 1}
+        options.seeds, episodes = 2, 2
+    else:  # both programs are compiled before anything is timed
+        for count in COUNTS:
+            trained(count, 99, 1, {"total_steps": 2_000})
+    rows = []
+    for seed in range(options.seeds):
+        for count in COUNTS:
+            rows.append(trained(count, seed, episodes, tiny))
+            print(rows[-1], flush=True)
+    table = pd.DataFrame(rows)
+    one, many = (table[table["environments"] == count] for count in COUNTS)
+    differences = many["mean"].to_numpy() - one["mean"].to_numpy()
+    reach = stats.t.ppf(0.975, len(differences) - 1) * stats.sem(differences)
+    share = many["seconds"].mean() / one["seconds"].mean()
+    body = [
+        [
+            str(count),
+            f"{own['mean'].mean():.3f} ± {own['mean'].std():.3f}",
+            f"{own['seconds'].mean():.1f}",
+            f"{own['updates'].iloc[0]:,}",
+        ]
+        for count, own in table.groupby("environments")
+    ]
+    text = markdown_table(["environments", "return", "seconds a lane", "updates"], body)
+    text += (
+        f"\n\nDifference of pairs {differences.mean():+.3f} "
+        f"[{differences.mean() - reach:+.3f}, {differences.mean() + reach:+.3f}] (95%); "
+        f"{share:.2f} of the time.\n"
+    )
+    steps = tiny.get("total_steps", ROVER_STEPS)
+    write_results(
+        options.out,
+        "many_environments",
+        table,
+        text,
+        provenance(agent=AGENT, disturbance=DISTURBANCE, episodes=episodes, steps=steps),
+    )
+    print(text)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
