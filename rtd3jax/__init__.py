@@ -19,6 +19,7 @@ from rtd3jax.envs.pendulum.filter import filter_policy
 from rtd3jax.envs.processes.disturbances import DampedSine, GaussianNoise, Hidden, Pulses, Sine
 from rtd3jax.envs.processes.faults import Delay, Dropout, GainDrift, OrnsteinUhlenbeck, Quantisation
 from rtd3jax.envs.processes.process import Chain, NoDisturbance, Nothing, Process, Sum
+from rtd3jax.envs.processes.recorded import Recorded
 from rtd3jax.envs.registry import make, register
 from rtd3jax.envs.rover.optimum import bayes_policy
 from rtd3jax.errors import UserError
@@ -27,6 +28,8 @@ from rtd3jax.evaluation.episode import Trajectory, rollout
 from rtd3jax.evaluation.gymnasium import run_in_gymnasium
 from rtd3jax.evaluation.plot import plot_episode
 from rtd3jax.evaluation.rollout import evaluate
+from rtd3jax.identification.fit import fit_process
+from rtd3jax.identification.result import Estimate, Fit
 from rtd3jax.policies.baselines import constant_policy, random_policy
 from rtd3jax.policies.export.stablehlo_file import load_stablehlo
 from rtd3jax.policies.load import load_policy
@@ -47,8 +50,10 @@ __all__ = [
     "Delay",
     "Drawing",
     "Dropout",
+    "Estimate",
     "Failure",
     "Finding",
+    "Fit",
     "GainDrift",
     "GaussianNoise",
     "Hidden",
@@ -61,6 +66,7 @@ __all__ = [
     "Process",
     "Pulses",
     "Quantisation",
+    "Recorded",
     "Run",
     "Sine",
     "Study",
@@ -77,6 +83,7 @@ __all__ = [
     "disturb",
     "evaluate",
     "filter_policy",
+    "fit_process",
     "function_policy",
     "load_policy",
     "load_stablehlo",

@@ -18,6 +18,7 @@ LAYERS = {
     "agents": 3,
     "policies": 4,
     "evaluation": 5,
+    "identification": 6,
     "training": 6,
     "study": 7,
     "policies.load": 8,

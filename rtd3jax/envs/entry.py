@@ -4,9 +4,13 @@ from typing import Any
 
 import gymnasium
 
+from rtd3jax.envs.processes.process import check_uses
 from rtd3jax.errors import UserError
 from rtd3jax.protocols import EnvironmentLike
 from rtd3jax.system.switches import check_switches
+
+DEFAULT_STEP_LIMIT = 10_000
+"""Steps after which an episode is cut where the environment names no time limit of its own."""
 
 METHODS = ("reset", "step", "action_space")
 """Without these nothing is a gymnax environment."""
@@ -18,11 +22,13 @@ def parameters_of(env: EnvironmentLike, params: object = None) -> Any:
     Every function that takes an environment calls this first.
 
     Raises:
-        UserError: for what is no gymnax >= 1.0 environment, or under one of JAX's switches with
-            which nothing here can work.
+        UserError: for what is no gymnax >= 1.0 environment, for a disturbance that cannot act
+            in its episodes, or under one of JAX's switches with which nothing here can work.
     """
     check_switches()
-    return own_parameters(env, params)
+    params = own_parameters(env, params)
+    check_uses(params, DEFAULT_STEP_LIMIT)
+    return params
 
 
 def own_parameters(env: EnvironmentLike, params: object = None) -> Any:

@@ -9,12 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rtd3jax.envs.entry import DEFAULT_STEP_LIMIT as DEFAULT_STEP_LIMIT
 from rtd3jax.envs.entry import check_gymnax
 from rtd3jax.errors import UserError
 from rtd3jax.protocols import EnvironmentLike
-
-DEFAULT_STEP_LIMIT = 10_000
-"""Steps after which an episode is cut where the environment names no time limit of its own."""
 
 MOST_BOUND = 1e20
 """An action's bound from here on means "no limit": its square is beyond float32."""

@@ -4,6 +4,8 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
+import jax
+
 from rtd3jax.study.derive import Reference
 from rtd3jax.study.early import EarlyAnswers
 from rtd3jax.study.loggers import Logger
@@ -11,7 +13,7 @@ from rtd3jax.study.plan import label
 from rtd3jax.study.recorder import Recorder
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.starts import add_starts
-from rtd3jax.training.checkpoint import Checkpoints
+from rtd3jax.training.checkpoint import MOST_NUMBERS, Checkpoints, named_numbers
 from rtd3jax.training.lanes import Group, Job, advance_groups, make_groups, workers
 from rtd3jax.training.progress import Progress
 
@@ -86,7 +88,11 @@ def checkpoints_of(
 
     def identity(job: Job) -> dict[str, Any]:
         cell, seed = job.key
-        return {**cell.to_dict(), "seed": seed, "window": job.program.window_tokens}
+        found = {**cell.to_dict(), "seed": seed, "window": job.program.window_tokens}
+        # A recording is named by its disturbance alone, and its file may have changed since.
+        large = [leaf for leaf in jax.tree.leaves(job.lane.env_params) if leaf.size > MOST_NUMBERS]
+        # First, so that a refusal names it where it is not the only difference.
+        return {"recorded": [named_numbers(leaf) for leaf in large], **found} if large else found
 
     return Checkpoints(
         lambda job: directory.lanes.checkpoint_directory(*job.key), identity, *interval

@@ -6,6 +6,7 @@ state: its random numbers are a function of seed and step, and how its steps are
 is immaterial, so a lane that goes on from a checkpoint ends with the same bits.
 """
 
+import hashlib
 import re
 import time
 import warnings
@@ -16,6 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from rtd3jax.errors import UserError
 from rtd3jax.system.files import read_arrays, write_arrays
@@ -28,6 +30,9 @@ DEFAULT_SECONDS = 300.0
 _PATIENCE = 150
 """A checkpoint waits by default for this many times what the last one took: with five lanes on two
 cores they cost 2% at most, however large the replay."""
+
+MOST_NUMBERS = 1_000
+"""Of an array that a checkpoint's identity spells out."""
 
 KEPT = 2
 LONGER = ("total_steps", "replay_capacity")
@@ -212,6 +217,18 @@ def why_not_longer(before: Mapping[str, Any], after: Mapping[str, Any], step: in
             f"({before['eval_every']:,})"
         )
     return None
+
+
+def named_numbers(leaf: ArrayLike) -> Any:
+    """A parameter of an environment, JSON-ready: its numbers, or a digest of very many.
+
+    A recording's numbers would fill a file's header, each time that a checkpoint is written.
+    """
+    array = np.asarray(leaf)
+    if array.size <= MOST_NUMBERS:
+        return array.tolist()
+    digest = hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
+    return f"{array.dtype}{list(array.shape)} of sha256 {digest}"
 
 
 def versions() -> dict[str, str]:

@@ -17,7 +17,7 @@ from rtd3jax.policies.trained import Policy
 from rtd3jax.protocols import EnvironmentLike
 from rtd3jax.system.files import user_path
 from rtd3jax.system.switches import check_compiling
-from rtd3jax.training.checkpoint import Checkpoints
+from rtd3jax.training.checkpoint import Checkpoints, named_numbers
 from rtd3jax.training.lanes import (
     Group,
     Job,
@@ -220,7 +220,7 @@ def _checkpoints(
 
     def identity(job: Job) -> dict[str, Any]:
         index, seed = job.key
-        params = [np.asarray(leaf).tolist() for leaf in jax.tree.leaves(job.lane.env_params)]
+        params = [named_numbers(leaf) for leaf in jax.tree.leaves(job.lane.env_params)]
         return {**configs[index].to_dict(), **world, "params": params, "seed": seed}
 
     return Checkpoints(lambda job: directories[job.cell] / f"seed-{job.seed}", identity, seconds)

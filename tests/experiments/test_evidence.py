@@ -212,3 +212,16 @@ def test_pairs_of_precisions_are_compared(tmp_path):
     mean, low, high = pairs.interval(np.array([0.1, 0.3, 0.2, 0.2, 0.2]))
     assert mean == pytest.approx(0.2) and low == pytest.approx(0.2 - 0.0878, abs=1e-4)
     assert high == pytest.approx(0.2 + 0.0878, abs=1e-4)
+
+
+@pytest.mark.slow
+def test_a_log_becomes_an_exported_policy(tmp_path, capsys):
+    script = load(EXPERIMENTS / "from_a_log.py")
+    script.main(["--quick", "--out", str(tmp_path)])
+    printed = capsys.readouterr().out
+    assert "trained on the recording: -" in printed and "ar1: Ar1Slip" in printed
+    assert (tmp_path / "fit.png").stat().st_size > 10_000
+    player = load(tmp_path / "policy.py").Player()
+    player.reset()
+    assert np.all(np.abs(player.step([-0.5, 0.0])) <= 1.0)
+    assert len((EXPERIMENTS / "from_a_log.py").read_text().splitlines()) <= 60

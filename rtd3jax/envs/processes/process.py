@@ -33,6 +33,12 @@ class Process(struct.PyTreeNode):
     def validate(self) -> None:
         """Raise UserError, naming the parameter, if a concrete parameter makes no sense."""
 
+    def check_use(self, horizon: int, field: str) -> None:
+        """Raise UserError if it cannot act throughout an episode of ``horizon`` steps.
+
+        ``field`` names what it acts on: the field of the environment's parameters that holds it.
+        """
+
 
 class NoDisturbance(Process):
     """Leaves the signal as it is."""
@@ -84,6 +90,11 @@ class Chain(Process):
         for process in self.processes:
             process.validate()
 
+    def check_use(self, horizon: int, field: str) -> None:
+        """Check every member."""
+        for process in self.processes:
+            process.check_use(horizon, field)
+
 
 class Sum(Process):
     """Several processes side by side: each sees the clean signal, and what they add is added up.
@@ -124,6 +135,26 @@ class Sum(Process):
         """Validate every member."""
         for process in self.processes:
             process.validate()
+
+    def check_use(self, horizon: int, field: str) -> None:
+        """Check every member."""
+        for process in self.processes:
+            process.check_use(horizon, field)
+
+
+def check_uses(params: object, unlimited: int) -> None:
+    """Raise UserError if a process anywhere in an environment's parameters cannot act there.
+
+    ``unlimited`` steps are an episode's where the parameters name no time limit; a traced limit is
+    not known yet.
+    """
+    horizon = getattr(params, "max_steps_in_episode", unlimited)
+    if isinstance(horizon, jax.core.Tracer) or np.ndim(horizon):
+        return
+    found = jax.tree_util.tree_leaves_with_path(params, lambda part: isinstance(part, Process))
+    for path, process in found:
+        if isinstance(process, Process):
+            process.check_use(int(horizon), str(getattr(path[-1], "name", "")) if path else "")
 
 
 def float32(value: ArrayLike) -> jax.Array:

@@ -1,0 +1,60 @@
+"""From wheel speeds in a CSV file to a policy that is trained, tested and exported.
+
+Usage: python experiments/from_a_log.py [LOG.csv] [--quick] [--out DIR]; see docs/from_a_log.md.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+import rtd3jax as rtd
+from rtd3jax.envs.rover import Rover, RoverParams
+from rtd3jax.envs.rover.registration import feedforward_pi
+from rtd3jax.envs.rover.slip import Ar1Slip
+from rtd3jax.study.presets import PRESETS
+
+
+def drive(out: Path, episodes: int) -> Path:
+    """Log the wheel speeds, in m/s, of a rover that is to drive straight on."""
+    rover = Rover(RoverParams(slip=Ar1Slip(rho=0.97, sigma=0.06)))
+    log = rtd.rollout(rtd.constant_policy([0.5, 0.0]), rover, episodes=episodes, seed=7)
+    speed, turn = log.true[:, 1:].reshape(-1, 2).T * [[1.0], [0.25]] + [[0.5], [0.0]]
+    frame = pd.DataFrame({"episode": np.repeat(np.arange(episodes), 200)})
+    for side, realised in (("left", speed - turn), ("right", speed + turn)):
+        frame[f"commanded_{side}"], frame[f"realised_{side}"] = 0.5, realised
+    frame.loc[300:309, "realised_left"] = np.nan  # an encoder without a signal for 10 steps
+    frame.to_csv(out / "log.csv", index=False, float_format="%.7f")
+    return out / "log.csv"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("log", nargs="?", type=Path, help="by default a rover is driven")
+    parser.add_argument("--quick", action="store_true", help="too short to learn anything")
+    parser.add_argument("--out", type=Path, default=Path("runs/from_a_log"))
+    (options := parser.parse_args(arguments)).out.mkdir(parents=True, exist_ok=True)
+    speeds = pd.read_csv(options.log or drive(options.out, 10 if options.quick else 50))
+    for side in ("left", "right"):
+        speeds[side] = 1.0 - speeds[f"realised_{side}"] / speeds[f"commanded_{side}"]
+    train, test = rtd.Recorded(speeds, columns=["left", "right"], channel="slip").split(0.8)
+    fit = rtd.fit_process(train, "ar1")
+    print(fit.summary(), rtd.fit_process(train, "sine").summary(), sep="\n")
+    fit.plot(options.out / "fit.png", overwrite=True)
+    settings = PRESETS["quick"][0].settings | {"algorithm": "lstm-td3-1ha1hc", "history_length": 1}
+    short = {"algorithm": "td3", "history_length": 0, "total_steps": 110, "learning_starts": 100}
+    config = rtd.Config(**(settings | (short if options.quick else {})))
+    plant = Rover(RoverParams(slip=test))
+    policies = {"constant": rtd.constant_policy([0.5, 0.0]), "PI": feedforward_pi(plant)}
+    policies["Bayes of the fit"] = rtd.bayes_policy(plant, fit.process)
+    for name, slips in {"fit": fit.process, "recording": train}.items():
+        run = rtd.train(Rover(RoverParams(slip=slips)), config, seeds=[0], progress=False)
+        policies[f"trained on the {name}"] = run.policy(seed=0)
+    for name, policy in policies.items():
+        print(f"{name}: {float(rtd.evaluate(policy, plant, episodes=200).mean()):.2f}")
+    policies["trained on the fit"].export(options.out / "policy.py", "numpy", overwrite=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,233 @@
+"""Logs that a user recorded, read as sequences of numbers without gaps."""
+
+import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rtd3jax.errors import UserError, first_line, nearest
+from rtd3jax.system.files import user_path
+
+if TYPE_CHECKING:  # with it comes a second of imports
+    import pandas as pd
+
+EPISODE = "episode"
+"""The column that is taken to number the episodes where none is named."""
+
+MOST_ROWS = 100_000_000
+"""Of a stretch that is interpolated: 800 MB of each element."""
+
+
+def read_log(
+    log: object,
+    columns: Sequence[str] | str | None = None,
+    episode: str | None = None,
+    period: float | None = None,
+    step: float | None = None,
+) -> list[np.ndarray]:
+    """The stretches of a log that have no gap, in their order: float64 [T, N] each.
+
+    Args:
+        log: a CSV or Parquet file, a pandas table, an array [T], [T, N] or [E, T, N] of E episodes,
+            or a list of arrays [T, N], one for each episode.
+        columns: of a file or table, one for each element of the signal, in that order; by default
+            all columns but the episode's.
+        episode: the column of a file or table in which another value begins another episode;
+            "episode" by default, where there is such a column.
+        period: time in s between two samples of the log, which are taken to be equally spaced.
+        step: time in s between two steps of the environment. Where it differs from ``period``, the
+            samples are interpolated linearly within each stretch; nothing is smoothed before, so
+            what is faster than two steps folds back.
+
+    A row in which any element is NaN, or empty, is a gap: the stretches before and after it are
+    two episodes, and nothing is filled in.
+
+    Raises:
+        UserError: for a file that cannot be read, columns that are not there, values that are no
+            finite numbers, or a log without any row.
+    """
+    what = "the recording"
+    if isinstance(log, str | os.PathLike):
+        what = str(log)
+        log = _read_table(log)
+    if hasattr(log, "columns") and hasattr(log, "iloc"):
+        episodes = _episodes_of_table(what, log, columns, episode)
+    else:
+        for name, value in (("columns", columns), ("episode", episode)):
+            if value is not None:
+                raise UserError(
+                    f"{name}={value!r} is for a file or a table; an array has no columns by name"
+                )
+        episodes = _episodes_of_arrays(what, log)
+    stretches = [part for whole in episodes for part in _without_gaps(what, whole)]
+    if not stretches:
+        raise UserError(f"{what} has no row with a number in every column: there is nothing in it")
+    return _resampled(what, stretches, period, step)
+
+
+def _read_table(path: str | os.PathLike) -> "pd.DataFrame":
+    """The table of a CSV or Parquet file."""
+    import pandas as pd
+
+    file = user_path(path)
+    readers = {".csv": pd.read_csv, ".parquet": pd.read_parquet, ".pq": pd.read_parquet}
+    read: Any = readers.get(file.suffix.lower())
+    if read is None:
+        raise UserError(f"{path} is neither a .csv nor a .parquet file: write the log as one")
+    try:
+        if file.is_file() and file.stat().st_size == 0:
+            raise UserError(f"{path} is empty: write a line of column names, and rows of numbers")
+        return read(file)
+    except UserError:
+        raise
+    except OSError as error:
+        reason = error.strerror or first_line(error)
+        raise UserError(f"{path} cannot be read ({reason})") from error
+    except Exception as error:  # pandas and Arrow have many; none of them is a fault of ours
+        raise UserError(f"{path} cannot be read as a table ({first_line(error)})") from error
+
+
+def _episodes_of_table(
+    what: str, table: "pd.DataFrame", columns: Sequence[str] | str | None, episode: str | None
+) -> list[np.ndarray]:
+    """The columns [T, N] of each episode of a table."""
+    there = [str(name) for name in table.columns]
+    table = table.set_axis(there, axis="columns")
+    if len(set(there)) < len(there):
+        raise UserError(f"{what} has two columns of one name: {', '.join(there)}; rename one")
+    if episode is None and EPISODE in there and EPISODE not in (columns or ()):
+        episode = EPISODE
+    chosen = [columns] if isinstance(columns, str) else columns
+    if chosen is None:
+        chosen = [name for name in there if name != episode]
+    for name in [*chosen, *([] if episode is None else [episode])]:
+        if name not in there:
+            raise UserError(
+                f"{what} has no column {name!r}{nearest(str(name), there)} "
+                f"(it has: {', '.join(there)})"
+            )
+    if not chosen:
+        raise UserError(f"{what}: no column is left to play (it has: {', '.join(there)})")
+    numbers = [_numbers(what, name, table[name]) for name in chosen]
+    values = np.stack(numbers, axis=1)
+    if episode is None:
+        return [values]
+    labels = table[episode].to_numpy()
+    if table[episode].isna().any():
+        raise UserError(f"{what}: column {episode!r} has rows without an episode; number them all")
+    begins = [0, *(np.flatnonzero(labels[1:] != labels[:-1]) + 1)] if len(labels) else []
+    firsts = [labels[begin] for begin in begins]
+    for place, label in enumerate(firsts):
+        if label in firsts[:place]:
+            raise UserError(
+                f"{what}: episode {label} goes on in row {begins[place]} after another one; sort "
+                f"the rows by {episode!r}"
+            )
+    return [values[a:b] for a, b in zip(begins, [*begins[1:], len(values)], strict=True)]
+
+
+def _numbers(what: str, name: str, column: "pd.Series") -> np.ndarray:
+    """A column as float64 [T], NaN where it is empty."""
+    import pandas as pd
+
+    kind = column.dtype
+    if getattr(kind, "kind", "O") in "bcmM":  # truth values, complex numbers, times
+        raise UserError(
+            f"{what}: column {name!r} holds {kind} and no numbers; leave it out by columns=[...]"
+        )
+    numbers = pd.to_numeric(column, errors="coerce")
+    odd = np.flatnonzero(numbers.isna().to_numpy() & column.notna().to_numpy())
+    if odd.size:
+        raise UserError(
+            f"{what}: column {name!r} has {column.iloc[odd[0]]!r} in row {odd[0]}, which is no "
+            "number; leave a gap empty, or choose other columns by columns=[...]"
+        )
+    return numbers.to_numpy(np.float64, na_value=np.nan)
+
+
+def _episodes_of_arrays(what: str, log: object) -> list[np.ndarray]:
+    """Arrays [T, N] of an array, or of a list of arrays."""
+    # Lists of lists are rows, as numpy has it; a list of arrays is a list of episodes.
+    if isinstance(log, list | tuple) and any(hasattr(part, "shape") for part in log):
+        return [one for part in log for one in _episodes_of_arrays(what, _array(what, part))]
+    array = _array(what, log)
+    if array.ndim == 1:
+        array = array[:, None]
+    if array.ndim not in (2, 3):
+        raise UserError(
+            f"{what} has shape {array.shape}; give [T], [T, N], [E, T, N], or a list of [T, N]"
+        )
+    if array.shape[-1] == 0:
+        raise UserError(f"{what} has no elements: its shape is {array.shape}")
+    return [array] if array.ndim == 2 else list(array)
+
+
+def _array(what: str, values: object) -> np.ndarray:
+    try:
+        array = np.asarray(values)
+        if array.dtype.kind not in "iuf" and not _is_narrow_float(array):
+            raise TypeError
+        return array.astype(np.float64)
+    except (TypeError, ValueError):
+        raise UserError(
+            f"{what} holds no plain numbers: give a CSV or Parquet file, a pandas table, or an "
+            f"array of floats, not {type(values).__name__}"
+        ) from None
+
+
+def _is_narrow_float(array: np.ndarray) -> bool:
+    """bfloat16 and its like, which numpy knows as void."""
+    return array.dtype.name.startswith(("bfloat", "float"))
+
+
+def _without_gaps(what: str, values: np.ndarray) -> list[np.ndarray]:
+    """The stretches of [T, N] between rows with NaN."""
+    most = float(np.finfo(np.float32).max)
+    if np.any(np.abs(values) > most):
+        row = int(np.flatnonzero(np.any(np.abs(values) > most, axis=1))[0])
+        raise UserError(
+            f"{what} is infinite in row {row} of an episode, or beyond float32; "
+            "leave such a row empty"
+        )
+    whole = ~np.any(np.isnan(values), axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], whole, [False]]).astype(np.int8)))
+    return [values[a:b] for a, b in edges.reshape(-1, 2)]
+
+
+def _resampled(
+    what: str, stretches: list[np.ndarray], period: float | None, step: float | None
+) -> list[np.ndarray]:
+    """The stretches at the environment's steps."""
+    if len({part.shape[1] for part in stretches}) > 1:
+        raise UserError(
+            f"{what} has episodes of {stretches[0].shape[1]} elements and of others; give every "
+            "episode the same elements"
+        )
+    if (period is None) != (step is None):
+        raise UserError(
+            "period= (of the log, in s) and step= (of the environment, in s) come together"
+        )
+    if period is None or step is None:
+        return stretches
+    for name, value in (("period", period), ("step", step)):
+        if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+            raise UserError(f"{name} must be a number of seconds, not {value!r}")
+        if not 0 < value < np.inf:
+            raise UserError(f"{name} must be finite and greater than zero, not {value!r}")
+    if period == step:
+        return stretches
+    found = []
+    for part in stretches:
+        rows = (len(part) - 1) * period / step
+        if rows >= MOST_ROWS:
+            raise UserError(
+                f"step={step} makes {rows:.3g} rows of a stretch of {len(part):,}; both times are "
+                "in s: check them"
+            )
+        have = period * np.arange(len(part))
+        # The last sample counts, where a rounding error would leave it out.
+        want = step * np.arange(int(np.floor(have[-1] / step + 1e-9)) + 1)
+        columns = [np.interp(want, have, part[:, k]) for k in range(part.shape[1])]
+        found.append(np.stack(columns, axis=1))
+    return found

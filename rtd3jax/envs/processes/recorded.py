@@ -1,0 +1,347 @@
+"""Recorded disturbances, played as they were measured."""
+
+import hashlib
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from rtd3jax.envs.log import read_log
+from rtd3jax.envs.processes.disturbances import check_elements
+from rtd3jax.envs.processes.process import Process, float32, require, require_ordered
+from rtd3jax.errors import UserError, nearest
+
+_PARAMETERS = (
+    *("log", "channel", "columns", "episode", "period", "step", "bounds", "elements"),
+    *("independent", "mirror"),
+)
+PLAYED_ON = ("observation", "action", "reward", "slip")
+MOST_ROWS = 2**31 - 1
+"""Rows are counted by int32."""
+
+
+class RecordedState(struct.PyTreeNode):
+    """Where in the recording each element is; N elements."""
+
+    value: jax.Array
+    """float32 [N], what the next signal meets"""
+    time: jax.Array
+    """int32 []: step of the episode"""
+    begin: jax.Array
+    """int32 [N]: row at which the recorded episode begins"""
+    length: jax.Array
+    """int32 [N]: rows of it"""
+    start: jax.Array
+    """int32 [N]: the row of it that was played first"""
+
+    @property
+    def slip(self) -> jax.Array:
+        """float32 [N], by the name under which the rover's pictures look for it."""
+        return self.value
+
+
+class Recorded(Process):
+    """Plays recorded sequences: in each episode a random stretch of a random recording.
+
+    Every row from which a whole episode of the environment fits into its recording is equally
+    likely to be the first. The elements are played together, from the same row, unless they are
+    ``independent``. What is played is added to the signal; ``channel="slip"`` makes of the signal
+    ``(1 - value)`` times the signal, as the slip of the rover's wheels does.
+
+    The numbers are leaves: recordings of equal shapes share one compiled program, and lanes of one
+    program may play different recordings. Equal recordings are equal, and have equal hashes.
+    """
+
+    values: Any
+    """float32 [R, N]: all rows of all recordings, one after the other"""
+    begins: Any
+    """int32 [E]: the first row of each of E recordings"""
+    lengths: Any
+    """int32 [E]: their rows"""
+    low: Any
+    """float32 [] or [N]: what is less is played as this"""
+    high: Any
+    """float32 [] or [N]: what is more is played as this"""
+    channel: str = struct.field(pytree_node=False)
+    elements: tuple[int, ...] = struct.field(pytree_node=False)
+    """Those of the signal that are disturbed, one for each column; () means all."""
+    independent: bool = struct.field(pytree_node=False)
+    mirror: bool = struct.field(pytree_node=False)
+
+    def __init__(
+        self,
+        log: object = None,
+        *,
+        channel: str = "observation",
+        columns: Sequence[str] | str | None = None,
+        episode: str | None = None,
+        period: float | None = None,
+        step: float | None = None,
+        bounds: tuple[Any, Any] | None = None,
+        elements: tuple[int, ...] = (),
+        independent: bool = False,
+        mirror: bool = False,
+        **fields: Any,
+    ) -> None:
+        """Read a log of N elements.
+
+        Args:
+            log: a CSV or Parquet file, a pandas table, an array [T], [T, N] or [E, T, N], or a list
+                of arrays [T, N]. A row with NaN is a gap: before and after it are two recordings.
+            channel: what was recorded: an offset of the "observation", the "action" or the
+                "reward", in its unit, or the "slip" of wheels, as a share of their speed.
+            columns: of a file or table; all but the episode's by default. See
+                `rtd3jax.envs.log.read_log`, for the next three too.
+            episode: the column that numbers the episodes; "episode" by default, where there is one.
+            period: time in s between two samples of the log.
+            step: time in s between two steps of the environment; the log is interpolated linearly.
+            bounds: (low, high) of what is played, numbers or arrays [N]; none by default.
+            elements: of the signal that are disturbed, one for each column; () means all.
+            independent: draw a recording and a start for each element by itself. That makes more
+                of a short log, and loses what the elements have in common.
+            mirror: let a recording that is shorter than an episode be played to its end, then
+                backwards, and so on. Without it such recordings are never played, and a log that
+                has no longer one is refused.
+            **fields: the fields of a recording that was read before; `replace` gives them.
+
+        Raises:
+            UserError: for a log that cannot be read or played.
+        """
+        if fields:
+            if log is not None or set(fields) != {"values", "begins", "lengths", "low", "high"}:
+                raise UserError(
+                    f"Recorded has no parameter {sorted(fields)[0]!r}"
+                    f"{nearest(sorted(fields)[0], _PARAMETERS)}"
+                )
+        else:
+            if log is None:
+                raise UserError("Recorded needs a log: a CSV or Parquet file, or an array [T, N]")
+            stretches = read_log(log, columns, episode, period, step)
+            low, high = _bounds(bounds)
+            fields = {**_leaves(stretches), "low": low, "high": high}
+        fields |= {
+            "channel": channel,
+            "elements": elements,
+            "independent": independent,
+            "mirror": mirror,
+        }
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
+        if log is not None:
+            self.validate()
+
+    def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> RecordedState:
+        """Draw which recording is played, and from where."""
+        self.output_size(size)
+        count = self.values.shape[-1]
+        draws = count if self.independent else 1
+        lengths = jnp.asarray(self.lengths, jnp.int32)
+        starts = self._starts(lengths, jnp.asarray(horizon, jnp.int32))
+        ends = jnp.cumsum(starts, dtype=jnp.int32)
+        place = jax.random.randint(key, (draws,), 0, jnp.maximum(ends[-1], 1), jnp.int32)
+        which = jnp.searchsorted(ends, place, side="right").astype(jnp.int32)
+        which = jnp.minimum(which, lengths.shape[0] - 1)
+        state = RecordedState(
+            value=jnp.zeros((count,), jnp.float32),
+            time=jnp.zeros((), jnp.int32),
+            begin=jnp.broadcast_to(jnp.asarray(self.begins, jnp.int32)[which], (count,)),
+            length=jnp.broadcast_to(lengths[which], (count,)),
+            start=jnp.broadcast_to(place - (ends[which] - starts[which]), (count,)),
+        )
+        return state.replace(value=self._value(state))
+
+    def _starts(self, lengths: jax.Array, horizon: jax.Array) -> jax.Array:
+        """Rows [E] of each recording at which an episode may begin."""
+        fitting = jnp.maximum(lengths - (self._needed(horizon) - 1), 0)
+        # Where the horizon is traced, nobody could refuse an episode that is too long: it mirrors.
+        anywhere = self.mirror | ~jnp.any(fitting > 0)
+        return jnp.where(anywhere & (fitting == 0), lengths, fitting)
+
+    def _needed(self, horizon: Any) -> Any:
+        """Signals in an episode: an observation is seen before its first step too."""
+        return horizon + (1 if self.channel == "observation" else 0)
+
+    def _value(self, state: RecordedState) -> jax.Array:
+        """What is played at the state's time, [N]; past the end the recording runs backwards."""
+        turn = jnp.maximum(2 * (state.length - 1), 1)
+        row = (state.start + state.time) % turn
+        row = state.begin + jnp.where(row < state.length, row, turn - row)
+        columns = jnp.arange(self.values.shape[-1], dtype=jnp.int32)
+        value = jnp.asarray(self.values, jnp.float32)[row, columns]
+        return jnp.clip(
+            value,
+            jnp.broadcast_to(float32(self.low), value.shape),
+            jnp.broadcast_to(float32(self.high), value.shape),
+        )
+
+    def step(
+        self, key: jax.Array, state: RecordedState, signal: jax.Array
+    ) -> tuple[jax.Array, RecordedState]:
+        """Play a row, then go on to the next."""
+        value = state.value
+        if self.elements:
+            everything = jnp.zeros(signal.shape, jnp.float32)
+            value = everything.at[jnp.asarray(self.elements, jnp.int32)].set(value)
+        signal = (1.0 - value) * signal if self.channel == "slip" else signal + value
+        state = state.replace(time=state.time + 1)
+        return signal, state.replace(value=self._value(state))
+
+    def output_size(self, size: int) -> int:
+        """Unchanged; UserError unless there is a column for each element that is disturbed."""
+        count = self.values.shape[-1]
+        if self.elements:
+            check_elements(self, self.elements, size)
+        elif count != size:
+            raise UserError(
+                f"Recorded: the recording has {count} element{'s' * (count != 1)} and the "
+                f"{self.channel} {size}; choose columns, or say which elements=(...) are disturbed"
+            )
+        return size
+
+    def check_use(self, horizon: int, field: str) -> None:
+        """Raise UserError unless this was recorded there, and some recording is long enough."""
+        if field in PLAYED_ON and self.channel not in (field, "slip"):
+            raise UserError(
+                f"Recorded: this recording is of the {self.channel}, and is to act on the {field}; "
+                f"say channel={field!r} where it is read"
+            )
+        if self.mirror or isinstance(self.lengths, jax.core.Tracer):
+            return
+        longest, needed = int(np.max(self.lengths)), self._needed(horizon)
+        if longest < needed:
+            raise UserError(
+                f"Recorded: the longest recording without a gap has {longest:,} rows, and an "
+                f"episode needs {needed:,}; lower max_steps_in_episode, or let recordings be "
+                "played back and forth by mirror=True"
+            )
+
+    def validate(self) -> None:
+        """Check the bounds, the channel and the elements."""
+        if self.channel not in PLAYED_ON:
+            raise UserError(
+                f"Recorded: channel {self.channel!r} must be one of {', '.join(PLAYED_ON)}"
+                f"{nearest(str(self.channel), PLAYED_ON)}"
+            )
+        for name in ("independent", "mirror"):
+            if not isinstance(getattr(self, name), bool):
+                raise UserError(f"Recorded: {name} must be True or False")
+        count = self.values.shape[-1]
+        for name in ("low", "high"):
+            require(self, name)
+            if np.ndim(getattr(self, name)) and np.shape(getattr(self, name)) != (count,):
+                raise UserError(f"Recorded: bounds are one number each, or {count} for each column")
+        require_ordered(self, "low", "high")
+        if self.elements:
+            whole = isinstance(self.elements, tuple) and all(
+                isinstance(element, int) for element in self.elements
+            )
+            if not whole:
+                raise UserError(f"Recorded: elements={self.elements!r} must be a tuple of indices")
+            check_elements(self, self.elements)
+            if len(self.elements) != count:
+                raise UserError(
+                    f"Recorded: {len(self.elements)} elements for a recording of {count} columns; "
+                    "give one for each"
+                )
+        if self.channel == "slip" and not isinstance(self.values, jax.core.Tracer):
+            played = np.clip(self.values, self.low, self.high)
+            if np.min(played) < -1.0 or np.max(played) > 1.0:
+                raise UserError(
+                    f"Recorded: slip is a share of the speed, and the recording goes from "
+                    f"{np.min(played):.3g} to {np.max(played):.3g}; divide it by the commanded "
+                    "speed, or give bounds=(0, 1)"
+                )
+
+    def sequences(self) -> list[np.ndarray]:
+        """The recordings, as they are played but for the bounds: float32 [T, N] each."""
+        values = np.asarray(self.values)
+        return [values[b : b + n] for b, n in zip(self.begins, self.lengths, strict=True)]
+
+    def split(self, fraction: float = 0.8) -> tuple["Recorded", "Recorded"]:
+        """The first ``fraction`` of the rows, to train on, and the rest, to test on.
+
+        Several recordings are shared out whole, in their order, so that no recording is on both
+        sides; the cut lies where it comes nearest to ``fraction``. A single one is cut in time.
+
+        Raises:
+            UserError: where one of the sides would be empty.
+        """
+        number = isinstance(fraction, float | int | np.number) and not isinstance(fraction, bool)
+        if not number or not 0.0 < fraction < 1.0:
+            raise UserError(f"split: fraction={fraction!r} must lie between 0 and 1")
+        parts = self.sequences()
+        rows = sum(map(len, parts))
+        if len(parts) > 1:
+            shares = np.cumsum([len(part) for part in parts])[:-1] / rows
+            cut = int(np.argmin(np.abs(shares - fraction))) + 1
+            sides = parts[:cut], parts[cut:]
+        else:
+            cut = round(fraction * rows)
+            if not 0 < cut < rows:
+                raise UserError(f"split: {rows} rows cannot be cut at {fraction:g} of them")
+            sides = [parts[0][:cut]], [parts[0][cut:]]
+        first, second = (self.replace(**_leaves(side)) for side in sides)
+        return first, second
+
+    def _digest(self) -> tuple:
+        leaves = (self.values, self.begins, self.lengths, self.low, self.high)
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+            return (id(self),)
+        if not all(
+            isinstance(leaf, np.ndarray | np.generic | jax.Array | float) for leaf in leaves
+        ):
+            return (*map(id, leaves), self.channel)
+        arrays = [np.ascontiguousarray(leaf) for leaf in leaves]
+        digest = hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
+        shapes = tuple(array.shape for array in arrays)
+        return (digest, shapes, self.channel, self.elements, self.independent, self.mirror)
+
+    def __eq__(self, other: object) -> bool:
+        """Whether both play the same numbers in the same way."""
+        if type(other) is not type(self):
+            return NotImplemented
+        return self._digest() == other._digest()
+
+    def __hash__(self) -> int:
+        """Of the numbers and of how they are played."""
+        return hash(self._digest())
+
+    def __repr__(self) -> str:
+        """What it is of, without its numbers."""
+        if not all(hasattr(leaf, "shape") for leaf in (self.values, self.lengths)):
+            return f"Recorded({self.values!r})"
+        return (
+            f"Recorded({self.lengths.shape[-1]} recordings, {self.values.shape[-2]:,} rows of "
+            f"{self.values.shape[-1]}, channel={self.channel!r})"
+        )
+
+
+def _leaves(stretches: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays of `Recorded` for these stretches [T, N]."""
+    lengths = np.array([len(part) for part in stretches], np.int32)
+    total = sum(map(len, stretches))
+    if total > MOST_ROWS:
+        raise UserError(f"Recorded: {total:,} rows are more than int32 can count; thin the log")
+    begins = np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int32)
+    return {
+        "values": np.concatenate(stretches).astype(np.float32),
+        "begins": begins,
+        "lengths": lengths,
+    }
+
+
+def _bounds(bounds: tuple[Any, Any] | None) -> tuple[np.ndarray, np.ndarray]:
+    """Low and high as float32; the whole of float32 where there are none."""
+    if bounds is None:
+        most = np.finfo(np.float32).max
+        bounds = (-most, most)
+    try:
+        low, high = (np.asarray(bound, np.float32) for bound in bounds)
+    except (TypeError, ValueError):
+        raise UserError(
+            f"Recorded: bounds={bounds!r} must be (low, high), numbers or one for each column"
+        ) from None
+    return low, high

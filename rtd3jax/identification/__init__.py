@@ -1,0 +1,1 @@
+"""Processes from logs: estimates, how sure they are, and pictures of both."""

@@ -1,0 +1,119 @@
+"""Logs are read without gaps, and whatever is wrong with them is one line."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from rtd3jax.envs.log import read_log
+from rtd3jax.errors import UserError
+
+NAN = float("nan")
+
+
+def test_arrays_of_every_shape():
+    one = np.arange(6.0)
+    assert [part.shape for part in read_log(one)] == [(6, 1)]
+    assert [part.shape for part in read_log(one.reshape(3, 2))] == [(3, 2)]
+    parts = read_log(np.arange(12).reshape(2, 3, 2))
+    np.testing.assert_array_equal(parts[1], [[6, 7], [8, 9], [10, 11]])
+    assert [len(part) for part in read_log([np.zeros((4, 2)), np.ones((7, 2))])] == [4, 7]
+    assert read_log([[1, 2], [3, 4]])[0].tolist() == [[1, 2], [3, 4]]
+    assert read_log([1, 2, 3])[0].tolist() == [[1.0], [2.0], [3.0]]
+
+
+def test_gaps_split_a_log_and_nothing_is_filled_in():
+    log = np.array([[0, 0], [1, 1], [NAN, 2], [3, 3], [4, NAN], [5, 5], [6, 6]])
+    assert [part[:, 0].tolist() for part in read_log(log)] == [[0, 1], [3], [5, 6]]
+
+
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
+def test_files_with_episodes(tmp_path, ending):
+    frame = pd.DataFrame({"episode": [4, 4, 4, 7, 7], "left": range(5), "right": [0, 1, NAN, 3, 4]})
+    path = tmp_path / f"log.{ending}"
+    frame.to_csv(path, index=False) if ending == "csv" else frame.to_parquet(path)
+    parts = read_log(path)
+    assert [part.tolist() for part in parts] == [[[0, 0], [1, 1]], [[3, 3], [4, 4]]]
+    assert [part.tolist() for part in read_log(str(path), "left")] == [[[0], [1], [2]], [[3], [4]]]
+    swapped = read_log(path, ["right", "left"], episode="episode")
+    assert swapped[1].tolist() == [[3, 3], [4, 4]]
+
+
+def test_another_rate_is_interpolated_within_each_stretch():
+    log = np.array([0.0, 1.0, 4.0, 9.0, NAN, 100.0, 101.0])
+    fine = read_log(log, period=0.1, step=0.05)
+    assert fine[0].ravel().tolist() == pytest.approx([0, 0.5, 1, 2.5, 4, 6.5, 9])
+    assert fine[1].ravel().tolist() == pytest.approx([100, 100.5, 101])
+    coarse = read_log(log[:4], period=0.1, step=0.15)
+    assert coarse[0].ravel().tolist() == pytest.approx([0, 2.5, 9])
+    assert read_log(log, period=0.1, step=0.1)[0].shape == (4, 1)
+
+
+@pytest.mark.parametrize(
+    ("content", "arguments", "match"),
+    [
+        ("", {}, "is empty"),
+        ("left,right\n", {}, "no row with a number in every column"),
+        ("left,right\n1,\n,2\n", {}, "no row with a number in every column"),
+        ("left,right\n1,n.a.!\n", {}, "column 'right' has 'n.a.!' in row 0"),
+        (
+            "left,right\n1,2\n",
+            {"columns": ["lefd"]},
+            r"'lefd'; did you mean 'left'\? \(it has: left",
+        ),
+        ("left,right\n1,2\n", {"episode": "run"}, r"no column 'run' \(it has: left, right\)"),
+        ("episode\n1\n", {}, "no column is left to play"),
+        ("episode,a\n1,0\n2,0\n1,0\n", {}, "episode 1 goes on in row 2 after another one"),
+        ("episode,a\n1,0\n,0\n", {}, "rows without an episode"),
+        ("a\n1\ninf\n", {}, "is infinite in row 1"),
+        ("a\n1e39\n", {}, "beyond float32"),
+        ("a\nTrue\nFalse\n", {}, "column 'a' holds bool"),
+        ("a\n1\n2\n", {"period": 0.1}, "come together"),
+        ("a\n1\n2\n", {"period": 1.0, "step": 1e-9}, "makes 1e.09 rows of a stretch of 2"),
+        ("a\n1\n2\n", {"period": 0.1, "step": 0.0}, "step must be finite and greater than zero"),
+        ("a\n1\n2\n", {"period": "1", "step": 1}, "period must be a number of seconds"),
+        ('a\n"1\n2', {}, "cannot be read as a table|which is no number"),
+    ],
+)
+def test_what_is_wrong_with_a_file_is_one_line(tmp_path, content, arguments, match):
+    path = tmp_path / "log.csv"
+    path.write_text(content)
+    with pytest.raises(UserError, match=match) as raised:
+        read_log(path, **arguments)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("log", "match"),
+    [
+        (np.zeros((2, 2, 2, 2)), "has shape"),
+        (np.zeros((3, 0)), "no elements"),
+        (np.zeros((0, 2)), "no row"),
+        ([], "no row"),
+        ([np.zeros((3, 2)), np.zeros((3, 1))], "episodes of 2 elements and of others"),
+        ("log.txt", "neither a .csv nor a .parquet"),
+        ("nowhere.csv", "cannot be read"),
+        (["a", "b"], "no plain numbers"),
+        (np.array([1 + 2j]), "no plain numbers"),
+        (np.array([True, False]), "no plain numbers"),
+        (None, "no plain numbers"),
+        (3.0, "has shape"),
+        (object(), "no plain numbers"),
+    ],
+)
+def test_what_is_no_log_is_one_line(log, match):
+    with pytest.raises(UserError, match=match) as raised:
+        read_log(log)
+    assert "\n" not in str(raised.value)
+
+
+def test_files_that_are_something_else(tmp_path):
+    (tmp_path / "odd.parquet").write_bytes(b"no table at all")
+    (tmp_path / "odd.csv").write_bytes(bytes(range(128, 256)))
+    (tmp_path / "folder.csv").mkdir()
+    for name in ("odd.parquet", "odd.csv", "folder.csv"):
+        with pytest.raises(UserError, match="cannot be read"):
+            read_log(tmp_path / name)
+    with pytest.raises(UserError, match="column 'a' holds complex128"):
+        read_log(pd.DataFrame({"a": [1j, 2j]}))
+    with pytest.raises(UserError, match="columns=.* is for a file or a table"):
+        read_log(np.zeros((3, 2)), columns=["left"])

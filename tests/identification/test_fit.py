@@ -1,0 +1,206 @@
+"""Processes with known parameters are simulated by themselves, fitted, and found again."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rtd3jax as rtd
+from rtd3jax.envs.rover import Rover, RoverParams
+from rtd3jax.envs.rover.slip import Ar1Slip, SineSlip
+from rtd3jax.errors import UserError
+from rtd3jax.identification.picture import autocorrelation, played, spectrum
+
+STEPS = 150
+
+
+def logs_of(process, logs, episodes, seed=5):
+    """Simulated logs: [logs, episodes, STEPS, 2]; the slip as an observer of the motion sees it."""
+    slip = isinstance(process, Ar1Slip | SineSlip)
+    signal = jnp.full((2,), 0.5 if slip else 0.0, jnp.float32)
+
+    def episode(key):
+        state = process.init(key, STEPS, 2)
+
+        def step(state, key):
+            out, state = process.step(key, state, signal)
+            return state, out
+
+        keys = jax.random.split(jax.random.fold_in(key, 1), STEPS)
+        return jax.lax.scan(step, state, keys)[1]
+
+    keys = jax.random.split(jax.random.key(seed), logs * episodes)
+    out = np.asarray(jax.jit(jax.vmap(episode))(keys), np.float64)
+    out = out.reshape(logs, episodes, STEPS, 2)
+    return 1.0 - out / 0.5 if slip else out
+
+
+def shares(fits, truth, factor=1.0, quantile=1.96):
+    """Of each parameter: the share of 95% intervals that cover ``factor`` times the truth."""
+    found = {}
+    for name, true in truth.items():
+        estimates = [fit.estimates[name] for fit in fits]
+        away = [abs(e.value - factor * true) / e.standard_error for e in estimates]
+        found[name] = float(np.mean(np.array(away) < quantile))
+    return found
+
+
+KNOWN = {
+    "ar1": (Ar1Slip(rho=0.9, sigma=0.08), 3, {"rho": 0.9, "sigma": 0.08}),
+    "ornstein-uhlenbeck": (
+        rtd.OrnsteinUhlenbeck(sigma=0.7, time_constant=5.0, mean=0.3),
+        10,
+        {"sigma": 0.7, "time_constant": 5.0, "mean": 0.3, "coefficient": math.exp(-0.2)},
+    ),
+    "noise": (rtd.GaussianNoise(sigma=0.4), 3, {"sigma": 0.4}),
+}
+
+
+@pytest.mark.parametrize("kind", KNOWN)
+def test_the_truth_lies_within_the_standard_errors_as_often_as_they_say(kind):
+    process, episodes, truth = KNOWN[kind]
+    logs = logs_of(process, 200, episodes)
+    fits = [rtd.fit_process(log, kind) for log in logs]
+    for name, share in shares(fits, truth).items():
+        assert 0.90 <= share <= 0.99, (name, share)
+    # An estimator that is off by a tenth would be found out.
+    assert all(share < 0.90 for share in shares(fits, truth, factor=1.1).values())
+    for name, true in truth.items():
+        value, error = fits[0].estimates[name]
+        assert abs(value - true) < 4.0 * error
+        if name != "coefficient":
+            assert getattr(fits[0].process, name) == value
+    assert type(fits[0].process) is type(process)
+    if kind == "ar1":
+        assert fits[0].process.max_slip == pytest.approx(0.5, abs=1e-5)
+
+
+def noisy_waves(logs, episodes):
+    """Slip in waves of one amplitude and period, seen with noise, far from the bounds."""
+    process = SineSlip(amplitude_min=0.2, amplitude_max=0.2, period_min=30, period_max=30)
+    slip = logs_of(process.replace(offset=0.5, max_slip=1.0), logs, episodes)
+    return slip + 0.02 * np.random.default_rng(0).standard_normal(slip.shape)
+
+
+def test_waves_are_found():
+    logs = noisy_waves(30, 6)
+    fits = [rtd.fit_process(log, "sine", max_slip=1.0) for log in logs]
+    truth = {"amplitude": 0.2, "period": 30.0, "offset": 0.5, "deviation": 0.02}
+    # An average of twelve waves, whose spread is estimated too, follows Student's t.
+    for name, share in shares(fits, truth, quantile=2.2).items():
+        assert 0.90 <= share <= 1.0, (name, share)
+    assert all(share < 0.5 for share in shares(fits, truth, factor=1.1).values())
+    alone = [rtd.fit_process(log[:1, :, :1], "sine", max_slip=1.0) for log in logs]
+    for name, share in shares(alone, truth).items():
+        assert 0.90 <= share <= 1.0, (name, share)
+
+
+def test_clipped_waves_and_the_ranges_they_are_drawn_from():
+    (log,) = logs_of(SineSlip(), 1, 12)
+    fit = rtd.fit_process(log, "sine")
+    process = fit.process
+    assert process.offset == pytest.approx(0.12, abs=1e-4)
+    assert 0.08 <= process.amplitude_min < 0.11 and 0.19 < process.amplitude_max <= 0.2201
+    assert 40 <= process.period_min < 48 and 82 < process.period_max <= 90
+    assert type(process.period_min) is int and fit.error < 1e-5
+    assert math.isnan(fit.estimates["period_min"].standard_error)
+
+
+def test_the_right_kind_explains_a_log_best():
+    (log,) = logs_of(Ar1Slip(), 1, 8)
+    fits = {kind: rtd.fit_process(log, kind) for kind in ("ar1", "sine", "ornstein-uhlenbeck")}
+    assert min(fits, key=lambda kind: fits[kind].error) == "ar1"
+    assert "clipped and counts as a probability" in fits["ar1"].summary()
+    (log,) = logs_of(KNOWN["ornstein-uhlenbeck"][0], 1, 8)
+    both = [rtd.fit_process(log, kind) for kind in ("ornstein-uhlenbeck", "noise")]
+    assert both[0].aic < both[1].aic and "GaussianNoise has none" in both[1].summary()
+    (log,) = logs_of(rtd.GaussianNoise(), 1, 8)
+    assert "GaussianNoise has none" not in rtd.fit_process(log, "noise").summary()
+
+
+def test_likelihoods_against_slow_sums():
+    (log,) = logs_of(KNOWN["ornstein-uhlenbeck"][0], 1, 2)
+    fit = rtd.fit_process(log, "ornstein-uhlenbeck")
+    process = fit.process
+    decay = math.exp(-1.0 / process.time_constant)
+    spread = process.sigma * math.sqrt(1.0 - decay**2)
+
+    def density(x, mean, deviation):
+        away = (x - mean) / deviation
+        return math.exp(-0.5 * away**2) / (deviation * math.sqrt(2.0 * math.pi))
+
+    total = 0.0
+    for wave in (wave for part in log for wave in part.T):
+        for x, y in zip(wave[:-1], wave[1:], strict=True):
+            total += math.log(density(y, process.mean + decay * (x - process.mean), spread))
+    assert fit.log_likelihood == pytest.approx(total)
+
+    (log,) = logs_of(Ar1Slip(rho=0.97, sigma=0.08), 1, 2)
+    fit = rtd.fit_process(log, "ar1")
+    rho, sigma = fit.process.rho, fit.process.sigma
+    total = 0.0
+    for wave in (wave for part in np.clip(log, 0.0, fit.process.max_slip) for wave in part.T):
+        for x, y in zip(wave[:-1], wave[1:], strict=True):
+            if 1e-5 < y < fit.process.max_slip - 1e-5:
+                total += math.log(density(y, rho * x, sigma))
+            else:
+                beyond = (0.0 - rho * x) if y < 0.1 else (rho * x - fit.process.max_slip)
+                total += math.log(0.5 * math.erfc(-beyond / sigma / math.sqrt(2.0)))
+    assert fit.log_likelihood == pytest.approx(total)
+
+
+def test_summary_and_picture(tmp_path):
+    (log,) = logs_of(Ar1Slip(), 1, 4)
+    fit = rtd.fit_process(rtd.Recorded(log, channel="slip", bounds=(0.0, 1.0)), "ar1")
+    text = fit.summary()
+    rho, error = fit.estimates["rho"]
+    assert f"{rho:.5g} ± {error:.2g}" in text and "4 recordings, 600 rows of 2" in text
+    path = tmp_path / "fit.png"
+    fit.plot(path)
+    assert path.read_bytes().startswith(b"\x89PNG") and path.stat().st_size > 10_000
+    with pytest.raises(UserError, match="exists"):
+        fit.plot(path)
+    with pytest.raises(UserError, match=r"end its name in .png"):
+        fit.plot(tmp_path / "fit.xyz")
+    env = Rover(RoverParams(slip=fit.process, max_steps_in_episode=20))
+    assert rtd.evaluate(rtd.bayes_policy(env), env, 2).shape == (2,)
+
+
+def test_what_the_picture_shows():
+    process = rtd.OrnsteinUhlenbeck(sigma=0.7, time_constant=5.0, mean=3.0)
+    waves = [wave for part in played(process, 300, 2, 100, 1) for wave in part.T]
+    assert np.mean(waves) == pytest.approx(3.0, abs=0.05)
+    expected = np.exp(-np.arange(10) / 5.0)
+    np.testing.assert_allclose(autocorrelation(waves, 10), expected, atol=0.04)
+    power = spectrum(waves, 300)
+    # Half of a white spectrum's power lies in each half; a period of the whole is the variance.
+    assert np.sum(power[1:-1]) / 300 == pytest.approx(0.49, rel=0.1)
+    assert spectrum(waves, 301) is None
+    slip = played(Ar1Slip(), 50, 2, 5, 0)
+    assert slip.min() >= 0.0 and slip.max() <= 0.5 + 1e-6 and slip.std() > 0.01
+
+
+@pytest.mark.parametrize(
+    ("log", "kind", "arguments", "match"),
+    [
+        (np.zeros((5, 1)), "noise", {}, "too few to fit"),
+        (np.ones((50, 2)), "noise", {}, "all values of the log are the same"),
+        (np.arange(50.0), "arima", {}, "kind 'arima' must be one of"),
+        (np.arange(50.0), "ar1", {}, "is of slip.*goes from 0 to 49"),
+        (np.arange(50.0) / 100, "ar1", {"max_slip": 0.3}, "less than the largest slip"),
+        (np.arange(50.0) / 100, "ar1", {"max_slip": 3}, "at most 1"),
+        (np.arange(50.0), "noise", {"max_slip": 0.5}, "max_slip is a parameter of ar1 and sine"),
+        (np.arange(50.0), "ornstein-uhlenbeck", {}, "wanders off without end"),
+        (np.tile([0.0, 1.0], 30), "ornstein-uhlenbeck", {}, "has no memory, or alternates"),
+        (np.repeat([0.0, 0.5], 30), "ar1", {}, "nearly all slip in the log is at a bound"),
+        (rtd.Recorded(np.arange(50.0)), "noise", {"step": 1}, "for the log that was read"),
+        ([np.arange(6.0) / 10] * 5, "sine", {}, "no recording has 8 rows"),
+        (np.full(50, np.nan), "noise", {}, "there is nothing in it"),
+    ],
+)
+def test_what_cannot_be_fitted_is_one_line(log, kind, arguments, match):
+    with pytest.raises(UserError, match=match) as raised:
+        rtd.fit_process(log, kind, **arguments)
+    assert "\n" not in str(raised.value)
