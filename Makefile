@@ -9,7 +9,7 @@ help:  ## these lines
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test,lint]'
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test,lint,docs]'
 	touch $@
 
 venv: $(VENV)/.installed  ## the environment, at the tested versions
@@ -22,9 +22,8 @@ bench: venv  ## how fast it is here, beside PyTorch: 20 minutes; the same comman
 		|| echo "PyTorch cannot be installed here"
 	$(BIN)/python -m experiments.benchmarks.bench $(ARGS)
 
-docs: venv  ## the API reference, from the docstrings: build/api/index.html
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
-	$(BIN)/pdoc rtd3jax --output-directory build/api
+docs: venv  ## the documentation's site: build/site/index.html
+	$(BIN)/mkdocs build --strict --quiet
 
 lint: venv  ## formatting, lint, types
 	$(BIN)/ruff format --check .

@@ -35,6 +35,7 @@ from rtd3jax.policies.export.stablehlo_file import load_stablehlo
 from rtd3jax.policies.load import load_policy
 from rtd3jax.policies.trained import Policy
 from rtd3jax.study.plan import Cell
+from rtd3jax.system.versions import versions_of
 from rtd3jax.training.run import Failure, Run, train
 
 __all__ = [
@@ -104,6 +105,8 @@ __all__ = [
     "to_gymnasium",
     "train",
 ]
+
+__version__ = versions_of(["rtd3jax"])["rtd3jax"]
 
 register_with_gymnasium()
 
