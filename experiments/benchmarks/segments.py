@@ -2,14 +2,16 @@
 
 Usage: python -m experiments.benchmarks.segments [--quick] [--agent A] [--lengths L ...]
                                                  [--segment-lengths M ...] [--repeats N]
-                                                 [--seconds S] [--batch-size B] [--out DIR]
+                                                 [--seconds S] [--batch-size B] [--torch]
+                                                 [--out DIR]
 
 One lane per core trains on the rover under AR(1) slip: environment step, replay and both updates.
-Every ratio is of neighbours in time; the table has the median. Writes segments.md, .parquet and
-.json under --out.
+Every ratio is of neighbours in time; the table has the median. With ``--torch`` PyTorch's windows
+take turns with ours, in a process per core. Writes segments.md, .parquet and .json under --out.
 """
 
 import argparse
+import contextlib
 import pathlib
 import sys
 import time
@@ -20,6 +22,7 @@ import pandas as pd
 import rtd3jax as rtd
 from experiments.benchmarks.bench import RESULTS, machine
 from experiments.benchmarks.ours import Lanes, make_config
+from experiments.benchmarks.torch_processes import PROCESS_PER_CORE, TorchProcesses
 from rtd3jax.training.lanes import workers
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
@@ -36,21 +39,36 @@ def ways(segment_lengths: list[int], batch_size: int) -> dict[str, dict[str, obj
     return found
 
 
-def measure(options: argparse.Namespace) -> pd.DataFrame:
+TORCH = "PyTorch, windows"
+
+
+def measure(options: argparse.Namespace, torch: TorchProcesses | None) -> pd.DataFrame:
     """Milliseconds of a core for a step: columns history_length, way, repeat, milliseconds."""
-    rows = []
+    rows, cores = [], len(workers())
     for length in options.lengths:
         sides = {}
         for name, fields in ways(options.segment_lengths, options.batch_size).items():
             size = {"hidden_size": options.width, "batch_size": options.batch_size}
             config = make_config(options.agent, length, **size, **fields)
-            sides[name] = Lanes(config, len(workers()))
+            sides[name] = Lanes(config, cores)
             sides[name].warm_up(options.seconds / 3)
+        if torch is not None:
+            torch.prepare(
+                agent=options.agent,
+                history_length=length,
+                width=options.width,
+                batch=options.batch_size,
+                capacity=config.capacity,
+                learning_starts=options.batch_size,
+                warm_up=4,
+            )
         for repeat in range(options.repeats):
             for name, lanes in sides.items():
                 steps, seconds = lanes.run(options.seconds)
-                milliseconds = 1e3 * seconds * len(workers()) / steps
-                rows.append((length, name, repeat, milliseconds))
+                rows.append((length, name, repeat, 1e3 * seconds * cores / steps))
+            if torch is not None:
+                rate = torch.run(PROCESS_PER_CORE, options.seconds)
+                rows.append((length, TORCH, repeat, 1e3 * cores / rate))
         print(f"l={length}: measured", flush=True)
     return pd.DataFrame(rows, columns=["history_length", "way", "repeat", "milliseconds"])
 
@@ -79,13 +97,17 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seconds", type=float, default=2.0)
     parser.add_argument("--batch-size", type=int, default=100)
     parser.add_argument("--width", type=int, default=128)
+    parser.add_argument("--torch", action="store_true", help="PyTorch's windows beside them")
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
     options = parser.parse_args(arguments)
     if options.quick:
         options.lengths, options.segment_lengths, options.repeats = [1], [5], 1
         options.seconds, options.batch_size, options.width = 0.05, 10, 8
     began = time.time()
-    found = measure(options)
+    with contextlib.ExitStack() as stack:
+        cores = len(workers())
+        torch = stack.enter_context(TorchProcesses(cores, cores)) if options.torch else None
+        found = measure(options, torch)
     text = table(found)
     facts = provenance(
         agent=options.agent,
