@@ -11,6 +11,7 @@ from rtd3jax.envs.about import Ceiling, Drawing
 from rtd3jax.envs.builtin import DISTURBANCES, ENVIRONMENTS
 from rtd3jax.envs.check import Finding, check_env, find_problems
 from rtd3jax.envs.compat.brax import from_brax
+from rtd3jax.envs.compat.from_gymnasium import from_gymnasium
 from rtd3jax.envs.compat.gymnasium import register_with_gymnasium, to_gymnasium
 from rtd3jax.envs.controllers import function_policy, lqr_policy, pid_policy
 from rtd3jax.envs.disturbed import disturb
@@ -91,6 +92,7 @@ __all__ = [
     "lqr_policy",
     "find_problems",
     "from_brax",
+    "from_gymnasium",
     "make",
     "make_agent",
     "pid_policy",

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
+from rtd3jax.envs.compat.from_gymnasium import without_handles
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import (
     DEFAULT_STEP_LIMIT,
@@ -314,7 +315,7 @@ def _pure(env: EnvironmentLike, params: object, record: _Record, seed: int) -> I
         with warnings.catch_warnings(), jax.numpy_rank_promotion(rank_promotion):
             warnings.simplefilter("ignore")
             program = jax.jit(lambda: both())
-            results += [program(), program()]
+            results += [without_handles(program()), without_handles(program())]
     for index, what in enumerate(("reset", "step")):
         if not all(_equal(results[0][index], other[index]) for other in results[1:]):
             yield Finding(

@@ -8,6 +8,7 @@ from flax import struct
 from gymnax.environments import environment, spaces
 from jax.typing import ArrayLike
 
+from rtd3jax.envs.compat.from_gymnasium import step_with_reset
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.identity import ValueIdentity, strong
 from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT, describe, foreign_code
@@ -133,8 +134,30 @@ class Disturbed(ValueIdentity, environment.Environment):
         self, key: jax.Array, params: DisturbedParams
     ) -> tuple[jax.Array, DisturbedState]:
         """Start an episode of all; returns the first observation [O]."""
+        return self._begun(key, *self.undisturbed_reset(key, params), params)
+
+    def reset_where(
+        self, where: jax.Array, key: jax.Array, state: DisturbedState, params: DisturbedParams
+    ) -> tuple[jax.Array, DisturbedState]:
+        """As `reset_env`, of a simulator's environment, which is reset only where ``where`` is."""
+        key_env, _, _ = jax.random.split(key, 3)
+        first, env = self.base.reset_where(where, key_env, state.env, params.env)
+        return self._begun(key, first, env, params)
+
+    def step(
+        self, key: jax.Array, state: object, action: ArrayLike, params: object = None
+    ) -> tuple:
+        """One step with automatic reset; a simulator is reset only at an episode's end."""
+        if not hasattr(self.base, "reset_where"):
+            return super().step(key, state, action, params)
+        params = self.default_params if params is None else params
+        return step_with_reset(self, key, state, action, params)
+
+    def _begun(
+        self, key: jax.Array, true_observation: jax.Array, env: object, params: DisturbedParams
+    ) -> tuple[jax.Array, DisturbedState]:
+        """The first observation and state, from those of the undisturbed environment."""
         _, key_init, key_process = jax.random.split(key, 3)
-        true_observation, env = self.undisturbed_reset(key, params)
         with foreign_code():
             actions = _action_size(self.base, params.env)
         (full,) = true_observation.shape

@@ -62,9 +62,8 @@ def check_gymnax(env: object) -> None:
         )
     if isinstance(env, gymnasium.Env | gymnasium.vector.VectorEnv):
         raise UserError(
-            f"{env} is a Gymnasium environment, and rtd3jax trains on gymnax ones, which are "
-            "compiled: write it in JAX (docs/bring_a_world.md), or play a trained policy in it by "
-            "rtd.run_in_gymnasium"
+            f"{env} is a Gymnasium environment: train on it by rtd.from_gymnasium(id, or a "
+            "function that makes it), or play a trained policy in it by rtd.run_in_gymnasium"
         )
     if hasattr(env, "action_size") and hasattr(env, "observation_size"):
         raise UserError(

@@ -13,6 +13,7 @@ from typing import Any, cast
 import gymnax
 
 from rtd3jax.envs.about import About, Drawing
+from rtd3jax.envs.compat.from_gymnasium import PREFIX, from_gymnasium
 from rtd3jax.envs.compat.gymnax import make_gymnax
 from rtd3jax.envs.disturbed import (
     CHANNELS,
@@ -85,7 +86,8 @@ def make(env_id: str, disturbance: str = "none", **parameters: Any) -> Any:
     """Make an environment whose ``default_params`` carry the disturbance and the parameters.
 
     Args:
-        env_id: one of ``ENVIRONMENTS``, a registered id, or a gymnax id.
+        env_id: one of ``ENVIRONMENTS``, a registered id, a gymnax id, or ``gymnasium:`` and an id
+            of Gymnasium's.
         disturbance: an id, or several joined by ``+``. Those that disturb the same thing act in
             that order.
         **parameters: fields of a disturbance, else of the environment's parameters. An environment
@@ -99,6 +101,8 @@ def make(env_id: str, disturbance: str = "none", **parameters: Any) -> Any:
     if entry is None and env_id in gymnax.registered_envs:
         remake = functools.partial(make_gymnax, env_id)
         entry = _Entry(make_gymnax(env_id), None, _NONE, "gymnax", with_params=remake)
+    if entry is None and env_id.startswith(PREFIX):
+        entry = _Entry(from_gymnasium(env_id.removeprefix(PREFIX)), None, _NONE, "gymnasium")
     if entry is None:
         known = (*_entries, *gymnax.registered_envs)
         raise UserError(f"unknown environment {env_id!r}{nearest(env_id, known)}")

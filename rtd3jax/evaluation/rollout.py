@@ -5,6 +5,7 @@ import functools
 import jax
 import jax.numpy as jnp
 
+from rtd3jax.envs.compat.from_gymnasium import release
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT, describe, foreign_code
 from rtd3jax.errors import UserError
@@ -118,5 +119,6 @@ def episode_returns(
         zeros,
         zeros,
     )
-    *_, total, true_total = jax.lax.while_loop(unfinished, step, start)
+    _, _, _, env_state, _, total, true_total = jax.lax.while_loop(unfinished, step, start)
+    release(env, env_state)
     return total, true_total

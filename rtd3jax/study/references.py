@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from rtd3jax.envs.compat.from_gymnasium import is_simulated
 from rtd3jax.envs.registry import about_of
 from rtd3jax.errors import UserError, first_line
 from rtd3jax.evaluation.rollout import both_returns
@@ -14,6 +15,8 @@ from rtd3jax.study.derive import Reference
 from rtd3jax.study.plan import Cell
 
 EPISODES = 1_000
+SIMULATED_EPISODES = 100
+"""Where a simulator on the host plays them."""
 
 
 def references_of(cells: Sequence[Cell]) -> list[Reference]:
@@ -42,12 +45,13 @@ def references_on(cell: Cell) -> list[Reference]:
         except Exception as error:  # a user's function may do anything
             reason = first_line(error)
             raise UserError(f"the baseline {name!r} of {cell.env} failed: {reason}") from error
+    episodes = SIMULATED_EPISODES if is_simulated(env) else EPISODES
     return [
         Reference(
             cell.env,
             cell.disturbance,
             name,
-            *map(np.asarray, both_returns(policy, env, EPISODES, 0)),
+            *map(np.asarray, both_returns(policy, env, episodes, 0)),
         )
         for name, policy in policies.items()
     ]

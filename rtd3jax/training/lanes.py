@@ -20,10 +20,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rtd3jax.envs.compat.simulator import close_simulators
 from rtd3jax.system.machine import cores
 from rtd3jax.system.program_cache import make_room, on_full
 from rtd3jax.training.checkpoint import Checkpoints
-from rtd3jax.training.loop import HEALTHY, Lane, LaneState, Program
+from rtd3jax.training.loop import HEALTHY, Lane, LaneState, Program, revived
 from rtd3jax.training.start import Start
 
 CHUNK_SECONDS = 1.0
@@ -185,6 +186,7 @@ def advance_groups(
         pool.stop()
         for thread in threads:
             thread.join()
+        close_simulators()
         if checkpoints is not None:
             for group in groups:
                 if group.state is not None and not group.finished:
@@ -272,6 +274,10 @@ def _restore(group: Group, checkpoints: Checkpoints) -> None:
     found = checkpoints.restore(group.jobs)
     if found is not None:
         states, step = found
+        states = [
+            revived(job.program, job.lane, s, step)
+            for job, s in zip(group.jobs, states, strict=True)
+        ]
         single = len(states) == 1
         state = states[0] if single else jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
         _advanced(group, state, step)

@@ -30,6 +30,7 @@ from rtd3jax.agents.replay import (
     store,
 )
 from rtd3jax.config import Config, traced_fields
+from rtd3jax.envs.compat.from_gymnasium import simulator_state
 from rtd3jax.envs.interface import action_bounds, foreign_code
 from rtd3jax.evaluation.rollout import episode_returns
 from rtd3jax.policies.trained import Policy
@@ -46,7 +47,7 @@ from rtd3jax.training.metrics import (
 HEALTHY, ENVIRONMENT_NOT_FINITE, LOSS_NOT_FINITE = 0, 1, 2
 
 # Streams of a lane's random numbers; each is folded into the lane's key once.
-_INIT, _RESET, _STEPS, _EVALUATION = range(4)
+_INIT, _RESET, _STEPS, _EVALUATION, _REVIVED = range(5)
 
 
 @struct.dataclass
@@ -392,6 +393,25 @@ class Program:
         return dataclasses.replace(
             state, returns=returns, true_returns=true_returns, metrics=metrics
         )
+
+
+def revived(program: Program, lane: Lane, state: LaneState, step: int) -> LaneState:
+    """A lane from a checkpoint; a simulator that cannot be brought back begins a fresh episode."""
+    env: Any = getattr(program.env, "base", program.env)
+    simulator = simulator_state(state.env_state)
+    if simulator is None or int(state.failure) != HEALTHY or env.goes_on(simulator):
+        return state
+    root = jax.random.key(lane.seed)
+    key = jax.random.fold_in(jax.random.fold_in(root, _REVIVED), step)
+    observation, env_state = program.env.reset(key, lane.env_params)
+    return dataclasses.replace(
+        state,
+        env_state=env_state,
+        observation=observation.astype(jnp.float32),
+        previous_action=jnp.zeros_like(state.previous_action),
+        age=jnp.int32(0),
+        carry=jax.tree.map(jnp.zeros_like, state.carry),
+    )
 
 
 def make_program(

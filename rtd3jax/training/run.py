@@ -10,6 +10,8 @@ import jax
 import numpy as np
 
 from rtd3jax.config import Config
+from rtd3jax.envs.compat.from_gymnasium import simulator_state
+from rtd3jax.envs.compat.simulator import fault_of
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
@@ -334,7 +336,11 @@ def failure_of(seed: int, state: LaneState) -> Failure | None:
     code = int(state.failure)
     if code == HEALTHY:
         return None
-    return Failure(seed, int(state.failed_at), _REASONS[code])
+    reason = _REASONS[code]
+    simulator = simulator_state(state.env_state)
+    if code == ENVIRONMENT_NOT_FINITE and simulator is not None:
+        reason = fault_of(int(simulator.handle)) or reason
+    return Failure(seed, int(state.failed_at), reason)
 
 
 def check_seeds(seeds: Iterable[int]) -> tuple[int, ...]:

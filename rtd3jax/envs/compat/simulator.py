@@ -1,0 +1,286 @@
+"""Gymnasium simulators on the host: who has which, and where in its episode each one is.
+
+A place in an episode is its reset seed and the actions since. A simulator that is asked for a place
+where it is not (after a resume, or since it was closed meanwhile) is replayed from the seed, and a
+digest of all that it answered tells whether it came to the same place to the bit.
+"""
+
+import atexit
+import contextlib
+import hashlib
+import itertools
+import queue
+import threading
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from rtd3jax.errors import UserError, first_line
+
+MOST = 1_024
+"""Simulators that are open at once, before the one that was used longest ago is closed."""
+
+SEED_DIGEST = (0, 0)
+
+
+class Fault(Exception):
+    """What a simulator did wrong, in one line."""
+
+
+class _Thread:
+    """A thread that does one call after another, so that one that hangs can be left behind."""
+
+    def __init__(self) -> None:
+        self._calls: queue.SimpleQueue = queue.SimpleQueue()
+        self._answers: queue.SimpleQueue = queue.SimpleQueue()
+        threading.Thread(target=self._work, daemon=True, name="simulator").start()
+
+    def _work(self) -> None:
+        while (call := self._calls.get()) is not None:
+            try:
+                self._answers.put((call(), None))
+            except BaseException as error:  # told to the caller
+                self._answers.put((None, error))
+
+    def do(self, call: Callable[[], Any], seconds: float) -> Any:
+        self._calls.put(call)
+        try:
+            answer, error = self._answers.get(timeout=seconds)
+        except queue.Empty:
+            raise TimeoutError from None
+        if error is not None:
+            raise error
+        return answer
+
+    def end(self) -> None:
+        self._calls.put(None)
+
+
+class Simulator:
+    """One instance of an environment.
+
+    Args:
+        make: makes it.
+        read: takes an observation apart: float64 [S], all elements.
+        step_seconds: the longest that one call may take.
+    """
+
+    def __init__(
+        self, make: Callable[[], Any], read: Callable[[Any], np.ndarray], step_seconds: float
+    ) -> None:
+        self.place: tuple[int, int, tuple[int, int]] | None = None
+        self.fault: str | None = None
+        self._read = read
+        self._seconds = step_seconds
+        self._thread = _Thread()
+        self._make = make
+        self._env: Any = None
+
+    def reset(self, seed: int) -> np.ndarray:
+        """The first observation of the episode, float64 [S]."""
+        self.place = None
+        if self._env is None:
+            self._env = self._call("the factory", self._make)
+        answer = self._call("reset", lambda: self._env.reset(seed=seed))
+        if not isinstance(answer, tuple) or len(answer) != 2:
+            raise self._wrong("reset must return (observation, info)")
+        observation = self._observation("reset", answer[0])
+        self.place = seed, 0, _digest(SEED_DIGEST, observation, 0.0)
+        return observation
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
+        """Observation [S], reward, terminated, truncated."""
+        assert self.place is not None
+        seed, time, digest = self.place
+        self.place = None
+        answer = self._call("step", lambda: self._env.step(action))
+        count = len(answer) if isinstance(answer, tuple) else 1
+        if count != 5:
+            raise self._wrong(
+                f"step returned {count} values; it must return (observation, reward, terminated, "
+                "truncated, info)"
+            )
+        observation = self._observation("step", answer[0])
+        try:
+            reward = float(np.asarray(answer[1], np.float64).reshape(()))
+        except (TypeError, ValueError):
+            raise self._wrong(f"the reward {answer[1]!r} is not a number") from None
+        if not np.isfinite(reward):
+            raise self._wrong(f"the reward is {reward}")
+        self.place = seed, time + 1, _digest(digest, observation, reward)
+        return observation, reward, bool(answer[2]), bool(answer[3])
+
+    def close(self) -> None:
+        """Close it, unless it hangs."""
+        self.place = None
+        if self._env is not None:
+            with contextlib.suppress(BaseException):  # nothing is left to be lost
+                self._thread.do(self._env.close, min(5.0, self._seconds))
+        self._thread.end()
+
+    def _call(self, what: str, call: Callable[[], Any]) -> Any:
+        if self.fault is not None:
+            raise Fault(self.fault)
+        try:
+            return self._thread.do(call, self._seconds)
+        except TimeoutError:
+            raise self._wrong(
+                f"{what} did not return within {self._seconds:g} s (step_seconds=...)"
+            ) from None
+        except UserError as error:
+            raise self._wrong(str(error)) from error
+        except BaseException as error:
+            message = f"{type(error).__name__}: {first_line(error)}"
+            raise self._wrong(f"{what} raised {message}") from error
+
+    def _observation(self, what: str, observation: object) -> np.ndarray:
+        try:
+            flat = self._read(observation)
+        except (TypeError, ValueError, KeyError, IndexError) as error:
+            raise self._wrong(f"the observation of {what} is unfit: {first_line(error)}") from None
+        if not np.isfinite(flat).all():
+            where = int(np.argmin(np.isfinite(flat)))
+            raise self._wrong(f"element {where} of the observation of {what} is {flat[where]}")
+        return flat
+
+    def _wrong(self, message: str) -> Fault:
+        self.fault = f"the simulator failed: {message}"
+        return Fault(self.fault)
+
+
+def _digest(before: Sequence[int], observation: np.ndarray, reward: float) -> tuple[int, int]:
+    text = np.asarray(before, np.uint32).tobytes() + observation.tobytes()
+    code = hashlib.blake2b(text + np.float64(reward).tobytes(), digest_size=8).digest()
+    first, second = np.frombuffer(code, np.uint32)
+    return int(first), int(second)
+
+
+class Fleet:
+    """All simulators of one environment in this process; every method may be called by any thread.
+
+    Args:
+        make: makes one.
+        read: see `Simulator`.
+        step_seconds: see `Simulator`.
+    """
+
+    def __init__(
+        self, make: Callable[[], Any], read: Callable[[Any], np.ndarray], step_seconds: float
+    ) -> None:
+        self._arguments = (make, read, step_seconds)
+        self._lock = threading.Lock()
+        self._busy: dict[int, Simulator] = {}
+        self._free: list[Simulator] = []
+        _fleets.append(self)
+
+    def reset(self, handle: int, seed: int) -> tuple[int, np.ndarray, tuple[int, int]]:
+        """Begin an episode in the simulator of ``handle``, or in another: its handle, [S], digest.
+
+        Raises:
+            Fault: with the simulator's handle as its second argument.
+        """
+        handle, simulator = self._take(handle)
+        try:
+            observation = simulator.reset(seed)
+        except Fault as fault:
+            raise Fault(str(fault), handle) from fault
+        assert simulator.place is not None
+        return handle, observation, simulator.place[2]
+
+    def at(
+        self,
+        handle: int,
+        place: tuple[int, int, tuple[int, int]],
+        past: Callable[[int], Sequence[np.ndarray]],
+    ) -> tuple[int, Simulator | None]:
+        """The simulator at ``place`` (seed, time, digest), replayed from its actions if need be.
+
+        None where the replay came to another place: the simulator is not deterministic.
+        """
+        with self._lock:
+            simulator = self._busy.get(handle)
+            if simulator is not None:
+                if simulator.fault is not None:
+                    raise Fault(simulator.fault, handle)
+                if simulator.place == place:
+                    self._busy[handle] = self._busy.pop(handle)
+                    return handle, simulator
+        handle, simulator = self._take(-1)
+        try:
+            simulator.reset(place[0])
+            for action in past(place[1]):
+                simulator.step(action)
+        except Fault as fault:
+            raise Fault(str(fault), handle) from fault
+        return handle, simulator if simulator.place == place else None
+
+    def release(self, handle: int) -> None:
+        """The simulator is free for another episode."""
+        with self._lock:
+            simulator = self._busy.get(handle)
+            if simulator is not None and simulator.fault is None:
+                del self._busy[handle]
+                self._free.append(simulator)
+
+    def close(self) -> None:
+        """Close all; a place that is asked for later is replayed."""
+        with self._lock:
+            simulators = [*self._busy.values(), *self._free]
+            faults = {h: s for h, s in self._busy.items() if s.fault is not None}
+            self._busy, self._free = faults, []
+        for simulator in simulators:
+            simulator.close()
+
+    @property
+    def count(self) -> int:
+        """Simulators that are open."""
+        with self._lock:
+            return len(self._free) + sum(s.fault is None for s in self._busy.values())
+
+    def fault(self, handle: int) -> str | None:
+        """What went wrong with a simulator."""
+        with self._lock:
+            simulator = self._busy.get(handle)
+            return None if simulator is None else simulator.fault
+
+    def _take(self, handle: int) -> tuple[int, Simulator]:
+        with self._lock:
+            simulator = self._busy.get(handle)
+            if simulator is not None:
+                return handle, simulator
+            handle = next(_handles)
+            if self._free:
+                simulator = self._busy[handle] = self._free.pop()
+                return handle, simulator
+            sound = [h for h, s in self._busy.items() if s.fault is None]
+            if len(sound) >= MOST:
+                simulator = self._busy[handle] = self._busy.pop(sound[0])
+                return handle, simulator
+            simulator = self._busy[handle] = Simulator(*self._arguments)
+            return handle, simulator
+
+
+_handles = itertools.count(1)
+_fleets: list[Fleet] = []
+
+
+def fault_of(handle: int) -> str | None:
+    """What went wrong with the simulator of this handle, in this process."""
+    return next((found for fleet in list(_fleets) if (found := fleet.fault(handle))), None)
+
+
+@atexit.register
+def close_simulators() -> None:
+    """Close every simulator of this process that is open; those asked for later are made anew."""
+    for fleet in list(_fleets):
+        fleet.close()
+
+
+def say(message: str) -> None:
+    """Warn in a thread in which nothing may be raised."""
+    try:
+        warnings.warn(message, stacklevel=3)
+    except Warning:
+        print(message)

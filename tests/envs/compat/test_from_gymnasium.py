@@ -1,0 +1,269 @@
+"""Gymnasium environments that are trained on: played, lost, resumed, refused."""
+
+import itertools
+import time
+import warnings
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rtd3jax as rtd
+from rtd3jax.envs.compat.simulator import Fault, close_simulators
+
+SMALL = rtd.Config(
+    algorithm="td3",
+    total_steps=60,
+    learning_starts=20,
+    eval_every=30,
+    eval_episodes=2,
+    hidden_size=8,
+    batch_size=8,
+    replay_capacity=60,
+)
+
+
+class Cart(gymnasium.Env):
+    """A point that is pushed; ends where it leaves the track. It may misbehave."""
+
+    observation_space = gymnasium.spaces.Dict(
+        a=gymnasium.spaces.Box(-9, 9, (2,), np.float64), b=gymnasium.spaces.Box(-1, 1, (1,))
+    )
+    action_space = gymnasium.spaces.Box(np.float32([-1, -3]), np.float32([2, 3]))
+    made = 0
+    closed = 0
+
+    def __init__(self, fault=None, at=10, noise=False, lost=()):
+        type(self).made += 1
+        self.fault, self.at, self.noise, self.lost = fault, at, noise, lost
+        self.count = 0
+        self.random = np.random.default_rng() if noise else None
+
+    def seen(self):
+        return {"a": np.array([self.x, self.v]), "b": np.zeros(1, np.float32)}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        assert seed is not None
+        self.x, self.v, self.time = self.np_random.uniform(-0.5, 0.5), 0.0, 0
+        return self.seen(), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        self.time += 1
+        self.count += 1
+        self.v += 0.1 * float(action[0]) + (1e-3 * self.random.normal() if self.noise else 0.0)
+        self.x += 0.1 * self.v
+        seen, reward = self.seen(), -(self.x**2)
+        if self.count >= self.at:
+            if self.fault == "raise":
+                raise RuntimeError("the wheel broke")
+            if self.fault == "hang":
+                time.sleep(3)
+            if self.fault == "nan":
+                seen["a"][1] = np.nan
+            if self.fault == "shape":
+                seen["a"] = np.zeros(3)
+            if self.fault == "reward":
+                reward = "much"
+            if self.fault == "four":
+                return seen, reward, False, {}
+        return seen, reward, abs(self.x) > 0.7, False, {}
+
+    def close(self):
+        type(self).closed += 1
+
+
+def make(**kwargs):
+    return Cart(**kwargs)
+
+
+def world(**kwargs):
+    return rtd.from_gymnasium(make, keep=[0, 2], max_steps_in_episode=12, **kwargs)
+
+
+def test_a_program_plays_what_a_loop_plays():
+    env = rtd.from_gymnasium(make, max_steps_in_episode=12)
+    assert env.element_names == ("a[0]", "a[1]", "b[0]")
+    params = env.default_params
+    _, state = jax.jit(env.reset)(jax.random.key(3), params)
+    step = jax.jit(env.step)
+    own = Cart()
+    seen, _ = own.reset(seed=int(state.seed))
+    lengths = []
+    for number in range(60):
+        action = jnp.array([2.0 * (-1) ** (number // 9), 0.5])
+        key = jax.random.fold_in(jax.random.key(4), number)
+        observation, state, reward, terminated, truncated, info = step(key, state, action, params)
+        seen, own_reward, end, _, _ = own.step(
+            np.clip(action, Cart.action_space.low, Cart.action_space.high)
+        )
+        np.testing.assert_array_equal(
+            info["final_observation"], np.float32([*seen["a"], *seen["b"]])
+        )
+        assert float(reward) == np.float32(own_reward) and bool(terminated) == end
+        assert bool(truncated) == (own.time == 12)
+        if end or truncated:
+            lengths.append(own.time)
+            seen, _ = own.reset(seed=int(state.seed))
+        np.testing.assert_array_equal(observation, np.float32([*seen["a"], *seen["b"]]))
+    assert 12 in lengths and min(lengths) < 12
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("strategy", ["map", "vmap"])
+def test_lanes_train_and_all_simulators_are_closed(strategy):
+    close_simulators()
+    made, closed = Cart.made, Cart.closed
+    run = rtd.train(world(), SMALL, seeds=range(2), progress=False, strategy=strategy)
+    assert np.isfinite(run.returns).all() and not run.failures
+    # One to be looked at, one for each lane; those of evaluations may serve both lanes.
+    assert 1 + 2 + 2 <= Cart.made - made <= 1 + 2 + 4
+    assert Cart.closed - closed == Cart.made - made
+    again = rtd.train(world(), SMALL, seeds=range(2), progress=False, strategy=strategy)
+    np.testing.assert_array_equal(run.returns, again.returns)
+
+
+def test_side_by_side_episodes_are_those_one_by_one():
+    env = rtd.from_gymnasium("Pendulum-v1")
+    policy = rtd.constant_policy([0.5])
+    returns = rtd.evaluate(policy, env, episodes=2, seed=1)
+    played = rtd.rollout(policy, env, seed=1, episodes=2)
+    np.testing.assert_allclose(returns, played.returns, rtol=1e-5)
+    assert played.truncated[:, -1].all() and list(played.lengths) == [200, 200]
+
+
+@pytest.mark.slow
+def test_a_simulator_composes_with_a_disturbance_and_is_reset_at_ends_alone():
+    env = rtd.disturb(world(), rtd.Delay())
+    rtd.check_env(world())
+    run = rtd.train(env, SMALL, seeds=[0], progress=False)
+    assert np.isfinite(run.returns).all()
+    assert rtd.make("gymnasium:Pendulum-v1", "dropout", p=0.2).name == "Pendulum-v1"
+
+
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        ("raise", "step raised RuntimeError: the wheel broke"),
+        ("hang", "did not return within 0.3 s"),
+        ("nan", "element 1 of the observation of step is nan"),
+        ("shape", "shape (3,) instead of (2,)"),
+        ("reward", "the reward 'much' is not a number"),
+        ("four", "step returned 4 values"),
+    ],
+)
+def test_a_simulator_that_fails_says_how_and_stays_lost(fault, message):
+    fleet = world(fault=fault, at=2, step_seconds=0.3).fleet
+    handle, _, _ = fleet.reset(-1, 5)
+    place = fleet._busy[handle].place
+    action = np.zeros(2, np.float32)
+    _, simulator = fleet.at(handle, place, lambda count: [])
+    simulator.step(action)
+    for _ in range(2):
+        with pytest.raises(Fault) as raised:
+            simulator.step(action)
+        assert message in str(raised.value) and "\n" not in str(raised.value)
+    with pytest.raises(Fault):
+        fleet.reset(handle, 6)
+
+
+def test_other_lanes_go_on():
+    number = itertools.count()
+
+    def some():  # the first is made to be looked at, the second is the first lane's
+        return Cart(fault="raise" if next(number) == 1 else None, at=25)
+
+    env = rtd.from_gymnasium(some, keep=[0], max_steps_in_episode=12)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        run = rtd.train(env, SMALL, seeds=range(2), progress=False)
+    assert len(run.failures) == 1 and run.failures[0].step == 24
+    assert "step raised RuntimeError: the wheel broke" in run.failures[0].reason
+    healthy = 1 - run.failures[0].seed
+    assert np.isfinite(run.returns[healthy]).all()
+
+
+@pytest.mark.parametrize("noise", [False, True])
+def test_resumed_lanes_end_with_the_same_bits(tmp_path, noise):
+    from rtd3jax.training.loop import revived
+    from rtd3jax.training.run import make_jobs
+
+    (job,) = make_jobs(world(noise=noise), SMALL, [0])
+    program, lane = job.program, job.lane
+    advance = jax.jit(program.advance)
+    state = advance(lane, jax.jit(program.init)(lane), jnp.int32(0), jnp.int32(33))
+    assert int(state.age) > 2
+    kept = jax.tree.map(lambda leaf: leaf, state)
+    whole = advance(lane, state, jnp.int32(33), jnp.int32(60))
+    close_simulators()  # as a new process: no simulator is where the lane was
+    if not noise:
+        resumed = advance(lane, revived(program, lane, kept, 33), jnp.int32(33), jnp.int32(60))
+        for one, other in zip(
+            jax.tree.leaves((whole.learner, whole.returns, whole.replay)),
+            jax.tree.leaves((resumed.learner, resumed.returns, resumed.replay)),
+            strict=True,
+        ):
+            np.testing.assert_array_equal(one, other)
+        return
+    with pytest.warns(UserWarning, match="not deterministic.*a fresh one begins"):
+        fresh = revived(program, lane, kept, 33)
+    assert int(fresh.age) == 0 and int(fresh.env_state.time) == 0
+    done = advance(lane, fresh, jnp.int32(33), jnp.int32(60))
+    assert int(done.failure) == 0
+
+
+class Discrete(Cart):
+    action_space = gymnasium.spaces.Discrete(3)
+
+
+class Unbounded(Cart):
+    action_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,))
+
+
+class Images(Cart):
+    observation_space = gymnasium.spaces.Box(0, 255, (8, 8, 3), np.uint8)
+
+
+def fails():
+    raise OSError("no licence")
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (Discrete, "choose an environment whose action space is a bounded Box"),
+        (Unbounded, "give them finite bounds"),
+        (Images, "images"),
+        (fails, "no licence"),
+        ("Pendulumm-v1", "did you mean 'Pendulum-v1'"),
+        (lambda: gymnasium.make_vec("Pendulum-v1", 2), "every lane makes its own"),
+        (lambda: 3, "not a gymnasium.Env"),
+        (Cart(), "a function that makes it"),
+        (7, "neither an id"),
+    ],
+)
+def test_what_is_refused_in_one_line(given, message):
+    with pytest.raises(rtd.UserError) as raised:
+        rtd.from_gymnasium(given)
+    assert message in str(raised.value) and "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("keep", [[], [0, 0], [5], [-1], slice(3, 3)])
+def test_elements_that_cannot_be_kept_are_refused(keep):
+    with pytest.raises(rtd.UserError, match="keep="):
+        rtd.from_gymnasium(make, keep=keep)
+
+
+@pytest.mark.slow
+def test_the_sweep_trains_by_name(tmp_path):
+    from rtd3jax.sweep import main
+
+    out = tmp_path / "run"
+    words = "--env gymnasium:Pendulum-v1 --algorithms td3 --seeds 1 --quiet --no-report "
+    words += "--total-steps 60 --learning-starts 20 --eval-every 60 --eval-episodes 1 "
+    words += f"--hidden-size 8 --batch-size 8 --final-episodes 1 --out {out}"
+    assert main(words.split()) == 0
+    assert "gymnasium:Pendulum-v1" in (out / "summary.md").read_text("utf-8")
