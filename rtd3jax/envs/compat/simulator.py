@@ -92,6 +92,8 @@ class Simulator:
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
         """Observation [S], reward, terminated, truncated."""
+        if self.fault is not None:
+            raise Fault(self.fault)
         assert self.place is not None
         seed, time, digest = self.place
         self.place = None

@@ -186,7 +186,7 @@ def test_other_lanes_go_on():
     assert np.isfinite(run.returns[healthy]).all()
 
 
-@pytest.mark.parametrize("noise", [False, True])
+@pytest.mark.parametrize("noise", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_resumed_lanes_end_with_the_same_bits(tmp_path, noise):
     from rtd3jax.training.loop import revived
     from rtd3jax.training.run import make_jobs
