@@ -403,13 +403,13 @@ def revived(program: Program, lane: Lane, state: LaneState, step: int) -> LaneSt
         return state
     root = jax.random.key(lane.seed)
     key = jax.random.fold_in(jax.random.fold_in(root, _REVIVED), step)
-    observation, env_state = program.env.reset(key, lane.env_params)
+    observation, env_state = program._reset(key, lane)
     return dataclasses.replace(
         state,
         env_state=env_state,
-        observation=observation.astype(jnp.float32),
+        observation=observation.astype(jnp.float32).reshape(state.observation.shape),
         previous_action=jnp.zeros_like(state.previous_action),
-        age=jnp.int32(0),
+        episode_step=jnp.zeros_like(state.episode_step),
         carry=jax.tree.map(jnp.zeros_like, state.carry),
     )
 

@@ -339,7 +339,8 @@ def failure_of(seed: int, state: LaneState) -> Failure | None:
     reason = _REASONS[code]
     simulator = simulator_state(state.env_state)
     if code == ENVIRONMENT_NOT_FINITE and simulator is not None:
-        reason = fault_of(int(simulator.handle)) or reason
+        handles = np.asarray(simulator.handle).reshape(-1)
+        reason = next(filter(None, map(fault_of, handles.tolist())), reason)
     return Failure(seed, int(state.failed_at), reason)
 
 

@@ -244,7 +244,10 @@ class FromGymnasium(ValueIdentity, environment.Environment):
         return flat[self._surface.indices].astype(np.float32)
 
     def goes_on(self, state: SimulatorState) -> bool:
-        """Whether a simulator can be brought to a state's place, to the bit; of a resumed lane."""
+        """Whether simulators can be brought to the places of a state, or of several, to the bit."""
+        if state.handle.ndim:
+            rows = range(state.handle.shape[0])
+            return all(self.goes_on(jax.tree.map(lambda leaf, k=k: leaf[k], state)) for k in rows)
         first, second = np.asarray(state.digest).tolist()
         place = int(state.seed), int(state.time), (first, second)
         past = self._commands(np.asarray(state.actions))

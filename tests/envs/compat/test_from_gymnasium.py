@@ -1,5 +1,6 @@
 """Gymnasium environments that are trained on: played, lost, resumed, refused."""
 
+import dataclasses
 import itertools
 import time
 import warnings
@@ -139,7 +140,8 @@ def test_side_by_side_episodes_are_those_one_by_one():
 def test_a_simulator_composes_with_a_disturbance_and_is_reset_at_ends_alone():
     env = rtd.disturb(world(), rtd.Delay())
     rtd.check_env(world())
-    run = rtd.train(env, SMALL, seeds=[0], progress=False)
+    config = dataclasses.replace(SMALL, environments=2)
+    run = rtd.train(env, config, seeds=[0], progress=False)
     assert np.isfinite(run.returns).all()
     assert rtd.make("gymnasium:Pendulum-v1", "dropout", p=0.2).name == "Pendulum-v1"
 
@@ -195,9 +197,9 @@ def test_resumed_lanes_end_with_the_same_bits(tmp_path, noise):
     program, lane = job.program, job.lane
     advance = jax.jit(program.advance)
     state = advance(lane, jax.jit(program.init)(lane), jnp.int32(0), jnp.int32(33))
-    assert int(state.age) > 2
+    assert int(state.episode_step[0]) > 2
     kept = jax.tree.map(lambda leaf: leaf, state)
-    whole = advance(lane, state, jnp.int32(33), jnp.int32(60))
+    whole = jax.block_until_ready(advance(lane, state, jnp.int32(33), jnp.int32(60)))
     close_simulators()  # as a new process: no simulator is where the lane was
     if not noise:
         resumed = advance(lane, revived(program, lane, kept, 33), jnp.int32(33), jnp.int32(60))
@@ -210,7 +212,7 @@ def test_resumed_lanes_end_with_the_same_bits(tmp_path, noise):
         return
     with pytest.warns(UserWarning, match="not deterministic.*a fresh one begins"):
         fresh = revived(program, lane, kept, 33)
-    assert int(fresh.age) == 0 and int(fresh.env_state.time) == 0
+    assert int(fresh.episode_step[0]) == 0 and int(fresh.env_state.time) == 0
     done = advance(lane, fresh, jnp.int32(33), jnp.int32(60))
     assert int(done.failure) == 0
 
