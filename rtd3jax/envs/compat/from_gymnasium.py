@@ -158,9 +158,11 @@ class FromGymnasium(ValueIdentity, environment.Environment):
             ((), jnp.bool_),
             ((), jnp.bool_),
             ((2,), jnp.uint32),
+            (action.shape, jnp.float32),
         )
         place = state.handle, state.seed, state.time, state.digest
-        handle, observation, reward, terminated, truncated, digest = _called(
+        # XLA may compute an action twice, by two roundings: what the host got is what is kept.
+        handle, observation, reward, terminated, truncated, digest, action = _called(
             self._step, shapes, None, *place, action, state.actions
         )
         actions = jax.lax.dynamic_update_slice(
@@ -226,11 +228,11 @@ class FromGymnasium(ValueIdentity, environment.Environment):
             _report(self.name, fault)
             number, lost = np.int32(fault.args[1]), np.float32(np.nan)
             nothing = np.full(len(self._surface.keep), np.nan, np.float32)
-            return number, nothing, lost, np.False_, np.False_, np.zeros(2, np.uint32)
+            return number, nothing, lost, np.False_, np.False_, np.zeros(2, np.uint32), action
         assert simulator.place is not None
         digest = np.asarray(simulator.place[2], np.uint32)
         flags = np.bool_(terminated), np.bool_(truncated)
-        return np.int32(found), self._seen(flat), np.float32(reward), *flags, digest
+        return np.int32(found), self._seen(flat), np.float32(reward), *flags, digest, action
 
     def _command(self, action: np.ndarray) -> np.ndarray:
         box = self._surface.actions
