@@ -1,0 +1,179 @@
+"""Agents trained on simulators behind Gymnasium: returns, and what a call to the host costs.
+
+Usage: python experiments/gymnasium_simulators.py [--quick] [--tasks T ...] [--out DIR]
+
+`pendulum`: Gymnasium's Pendulum-v1 and our own pendulum, `td3`, five seeds each with the same
+setting; the difference of their means with its 95% interval (Welch). `inverted`: MuJoCo's
+InvertedPendulum-v5 with its velocities hidden, `lstm-td3-1ha1hc` and `td3`, three seeds, 30,000
+steps. `cheetah`: HalfCheetah-v5 with its velocities hidden, one seed of each, 100,000 steps.
+`cost`: milliseconds of a step of `td3` on Pendulum-v1, less those of the simulator alone and of the
+same agent on our own pendulum. Writes gymnasium_simulators.md, .parquet and .json; rows that are
+there are kept.
+"""
+
+import argparse
+import pathlib
+import sys
+import time
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+import rtd3jax as rtd
+from rtd3jax.study.presets import PENDULUM_SETTINGS
+
+sys.path.insert(0, str(pathlib.Path(__file__).parent))
+from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
+
+SETTING: dict[str, Any] = {**PENDULUM_SETTINGS, "eval_every": 5_000, "eval_episodes": 5}
+RECURRENT = {"algorithm": "lstm-td3-1ha1hc", "history_length": 6}
+FEED_FORWARD = {"algorithm": "td3"}
+TASKS: dict[str, list[tuple[str, dict[str, Any], int, dict[str, Any]]]] = {
+    "pendulum": [
+        ("Pendulum-v1", {}, 5, {**FEED_FORWARD, "total_steps": 20_000}),
+        ("our pendulum", {}, 5, {**FEED_FORWARD, "total_steps": 20_000}),
+    ],
+    "inverted": [
+        ("InvertedPendulum-v5", {"keep": (0, 1)}, 3, {**RECURRENT, "total_steps": 30_000}),
+        ("InvertedPendulum-v5", {"keep": (0, 1)}, 3, {**FEED_FORWARD, "total_steps": 30_000}),
+    ],
+    "cheetah": [
+        ("HalfCheetah-v5", {"keep": range(8)}, 1, {**RECURRENT, "total_steps": 100_000}),
+        ("HalfCheetah-v5", {"keep": range(8)}, 1, {**FEED_FORWARD, "total_steps": 100_000}),
+    ],
+}
+OWN = {
+    "InvertedPendulum-v5": {"gamma": 0.99, "exploration_noise": 0.1},
+    "HalfCheetah-v5": {"gamma": 0.99, "exploration_noise": 0.1, "update_every": 1},
+}
+"""Fields in which a task differs from the pendulum's setting."""
+EPISODES = 100
+
+
+def make(name: str, how: dict[str, Any]) -> Any:
+    """The environment of a task."""
+    return rtd.make("pendulum") if name == "our pendulum" else rtd.from_gymnasium(name, **how)
+
+
+def trained(task: str, index: int, episodes: int, tiny: dict[str, Any]) -> list[dict[str, Any]]:
+    """Train and test one line of a task; a row per seed."""
+    name, how, seeds, fields = TASKS[task][index]
+    env = make(name, how)
+    config = rtd.Config(**{**SETTING, **OWN.get(name, {}), **fields, **tiny})
+    began = time.perf_counter()
+    run = rtd.train(env, config, range(1 if tiny else seeds), progress=False)
+    seconds = time.perf_counter() - began
+    return [
+        {
+            "task": task,
+            "environment": name,
+            "algorithm": config.algorithm,
+            "steps": config.total_steps,
+            "seed": seed,
+            "mean": float(np.mean(rtd.evaluate(run.policy(seed), env, episodes, seed=seed))),
+            "curve": run.returns[index_of].tolist(),
+            "seconds": seconds,
+        }
+        for index_of, seed in enumerate(run.seeds)
+    ]
+
+
+def cost(steps: int) -> dict[str, Any]:
+    """Milliseconds of a step: of training on the simulator, on our own, and of the simulator."""
+    found: dict[str, list[float]] = {"simulated": [], "own": [], "simulator": []}
+    config = rtd.Config(**{**SETTING, **FEED_FORWARD, "total_steps": steps, "eval_every": steps})
+    environments = {"simulated": rtd.from_gymnasium("Pendulum-v1"), "own": rtd.make("pendulum")}
+    for repeat in range(4):
+        for name, env in environments.items():
+            began = time.perf_counter()
+            rtd.train(env, config, [repeat], progress=False)
+            found[name].append(1e3 * (time.perf_counter() - began) / steps)
+        simulator = gymnasium.make("Pendulum-v1")
+        simulator.reset(seed=repeat)
+        began = time.perf_counter()
+        for _ in range(steps):
+            *_, truncated, _ = simulator.step(np.float32([0.5]))
+            if truncated:
+                simulator.reset()
+        found["simulator"].append(1e3 * (time.perf_counter() - began) / steps)
+    # The first round compiles.
+    return {name: float(np.median(values[1:])) for name, values in found.items()}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
+    parser.add_argument("--tasks", nargs="+", choices=(*TASKS, "cost"), default=["pendulum"])
+    parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
+    options = parser.parse_args(arguments)
+    tiny: dict[str, Any] = {}
+    episodes = EPISODES
+    if options.quick:
+        tiny = {"total_steps": 60, "hidden_size": 4, "learning_starts": 50, "eval_every": 60}
+        episodes = 1
+    path = options.out / "gymnasium_simulators.parquet"
+    rows = pd.read_parquet(path).to_dict("records") if path.exists() else []
+    for task in options.tasks:
+        if task == "cost":
+            times = cost(1_100 if options.quick else 5_000)
+            rows = [row for row in rows if row["task"] != "cost"]
+            rows += [{"task": "cost", "environment": k, "seconds": v} for k, v in times.items()]
+            continue
+        for index, (name, _, _, fields) in enumerate(TASKS[task]):
+            own = (name, fields["algorithm"])
+            if any((row["environment"], row.get("algorithm")) == own for row in rows):
+                continue
+            rows += trained(task, index, episodes, tiny)
+            options.out.mkdir(parents=True, exist_ok=True)
+            pd.DataFrame(rows).to_parquet(path, index=False)
+            print(own, [round(row["mean"], 1) for row in rows if row["environment"] == name])
+    table = pd.DataFrame(rows)
+    text = report(table)
+    setting = {**SETTING, "other fields": OWN}
+    write_results(
+        options.out,
+        "gymnasium_simulators",
+        table,
+        text,
+        provenance(episodes=episodes, setting=setting, gymnasium=gymnasium.__version__),
+    )
+    print(text)
+    return 0
+
+
+def report(table: pd.DataFrame) -> str:
+    """All tasks as one table, the pendulum's difference, and the cost of a step."""
+    body = []
+    lanes = table[table["task"] != "cost"]
+    for (name, algorithm), own in lanes.groupby(["environment", "algorithm"], sort=False):
+        values = own["mean"]
+        spread = f" ± {values.std():.1f}" if len(values) > 1 else ""
+        steps, seeds = f"{int(own['steps'].iloc[0]):,}", str(len(values))
+        body.append([name, algorithm, steps, seeds, f"{values.mean():.1f}{spread}"])
+    text = markdown_table(["environment", "agent", "steps", "seeds", "return"], body)
+    ours, theirs = (
+        lanes[lanes["environment"] == name]["mean"].to_numpy()
+        for name in ("our pendulum", "Pendulum-v1")
+    )
+    if min(len(ours), len(theirs)) > 1:
+        found = stats.ttest_ind(theirs, ours, equal_var=False).confidence_interval()
+        text += (
+            f"\n\nPendulum-v1 less our pendulum: {theirs.mean() - ours.mean():+.1f} "
+            f"[{found.low:+.1f}, {found.high:+.1f}] (95%).\n"
+        )
+    times = table[table["task"] == "cost"].set_index("environment")["seconds"].to_dict()
+    if times:
+        extra = times["simulated"] - times["own"] - times["simulator"]
+        text += (
+            f"\n\nA step of td3 takes {times['simulated']:.3f} ms on Pendulum-v1, "
+            f"{times['own']:.3f} ms on our own, and the simulator alone {times['simulator']:.3f} "
+            f"ms: {extra:.3f} ms a step for the way to the host and back.\n"
+        )
+    return text
+
+
+if __name__ == "__main__":
+    sys.exit(main())
