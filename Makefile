@@ -35,10 +35,10 @@ format: venv  ## mend what ruff can mend
 	$(BIN)/ruff check --fix .
 
 test: lint  ## lint and the whole test suite
-	$(BIN)/pytest -n 2
+	$(BIN)/pytest -n 2 --dist worksteal
 
 test-slow: venv  ## the tests that are too slow for every change
-	$(BIN)/pytest -n 2 -m slow
+	$(BIN)/pytest -n 2 --dist worksteal -m slow
 
 clean:  ## remove what can be made again (never runs/)
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis build *.egg-info

@@ -24,6 +24,9 @@ MOST = 1_024
 
 SEED_DIGEST = (0, 0)
 
+_CLOSING_SECONDS = 5.0
+"""The longest that is waited for a simulator to close."""
+
 
 class Fault(Exception):
     """What a simulator did wrong, in one line."""
@@ -77,6 +80,7 @@ class Simulator:
         self._thread = _Thread()
         self._make = make
         self._env: Any = None
+        self._closed = False
 
     def reset(self, seed: int) -> np.ndarray:
         """The first observation of the episode, float64 [S]."""
@@ -115,11 +119,14 @@ class Simulator:
         return observation, reward, bool(answer[2]), bool(answer[3])
 
     def close(self) -> None:
-        """Close it, unless it hangs."""
+        """Close it, unless it hangs; a second time does nothing."""
         self.place = None
+        if self._closed:
+            return
+        self._closed = True
         if self._env is not None:
             with contextlib.suppress(BaseException):  # nothing is left to be lost
-                self._thread.do(self._env.close, min(5.0, self._seconds))
+                self._thread.do(self._env.close, min(_CLOSING_SECONDS, self._seconds))
         self._thread.end()
 
     def _call(self, what: str, call: Callable[[], Any]) -> Any:

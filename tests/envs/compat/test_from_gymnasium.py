@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import rtd3jax as rtd
-from rtd3jax.envs.compat.simulator import Fault, close_simulators
+from rtd3jax.envs.compat.simulator import Fault, Simulator, close_simulators
 
 SMALL = rtd.Config(
     algorithm="td3",
@@ -269,3 +269,26 @@ def test_the_sweep_trains_by_name(tmp_path):
     words += f"--hidden-size 8 --batch-size 8 --final-episodes 1 --out {out}"
     assert main(words.split()) == 0
     assert "gymnasium:Pendulum-v1" in (out / "summary.md").read_text("utf-8")
+
+
+def test_one_that_hangs_is_waited_for_once(monkeypatch):
+    """It keeps its fault, for the lane's message; every later training would wait for it again."""
+
+    class Plain:
+        def reset(self, seed):
+            return np.zeros(1), {}
+
+        def close(self):
+            """Nothing is open."""
+
+    simulator, waited = Simulator(Plain, lambda observation: observation, 5.0), []
+    simulator.reset(0)
+
+    def hang(call, seconds):
+        waited.append(seconds)
+        raise TimeoutError
+
+    monkeypatch.setattr(simulator._thread, "do", hang)
+    simulator.close()
+    simulator.close()
+    assert waited == [5.0]
