@@ -170,8 +170,8 @@ class Config:
     )
     actor_starts: int | None = _field(
         None,
-        "environment step from which on the actor is updated, where its critics must learn first "
-        "[learning_starts]",
+        "environment step from which on td3's learner updates the actor, where its critics must "
+        "learn first [learning_starts]",
         low=0,
     )
     precision: str = dataclasses.field(
@@ -284,6 +284,17 @@ class Config:
                 raise UserError(
                     f"{name} ({value:,}) is not a multiple of environments ({count}), which step "
                     f"together; {lower:,} would be"
+                )
+        rows = self.segment_steps * count if self.replay == "segments" else 0
+        for name, value in (
+            ("learning_starts", self.learning_starts),
+            ("replay_capacity", capacity),
+        ):
+            if value < rows:
+                raise UserError(
+                    f"{name} ({value:,}) holds less than a segment of each environment "
+                    f"(segment_length {self.segment_steps} x environments {count} = {rows:,}): "
+                    "raise it, or lower one of the two"
                 )
         if self.update_every % count and count % self.update_every:
             raise UserError(

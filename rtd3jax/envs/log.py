@@ -96,9 +96,9 @@ def _episodes_of_table(
     table = table.set_axis(there, axis="columns")
     if len(set(there)) < len(there):
         raise UserError(f"{what} has two columns of one name: {', '.join(there)}; rename one")
-    if episode is None and EPISODE in there and EPISODE not in (columns or ()):
-        episode = EPISODE
     chosen = [columns] if isinstance(columns, str) else columns
+    if episode is None and EPISODE in there and EPISODE not in (chosen or ()):
+        episode = EPISODE
     if chosen is None:
         chosen = [name for name in there if name != episode]
     for name in [*chosen, *([] if episode is None else [episode])]:

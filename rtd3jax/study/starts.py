@@ -61,8 +61,12 @@ def _start(directory: RunDirectory, cell: Cell, seed: int, disturbance: str) -> 
         if (other.config.algorithm, other.config.memory) == (config.algorithm, config.memory)
         and disturbance in ("", other.disturbance)
     ]
-    same = [c for c in fitting if c.config.history_length == config.history_length]
-    fitting = same or fitting
+    for alike in (
+        [c for c in fitting if c.config.history_length == config.history_length],
+        [c for c in fitting if c.env == cell.env],
+    ):
+        both = [c for c in fitting if c in alike]
+        fitting = both or fitting
     wanted = f"{config.algorithm}{f' under {disturbance}' if disturbance else ''}"
     if not fitting:
         there = dict.fromkeys(
@@ -71,6 +75,12 @@ def _start(directory: RunDirectory, cell: Cell, seed: int, disturbance: str) -> 
         raise UserError(f"{path} has no {wanted} to begin from, only {', '.join(there)}")
     if len(fitting) > 1:
         names = dict.fromkeys(f"{path}@{other.disturbance}" for other in fitting)
+        if len(names) == 1:
+            raise UserError(
+                f"{len(fitting)} cells of {path} fit {wanted}: they differ in environment or "
+                "history_length, and none has those of the new training; save the policy that you "
+                "want (rtd.load_policy(...).save) and start from its file"
+            )
         raise UserError(
             f"{len(fitting)} cells of {path} fit {wanted}; say which disturbance: "
             f"{' or '.join(names)}"

@@ -30,7 +30,7 @@ from rtd3jax.agents.replay import (
     store,
 )
 from rtd3jax.config import Config, traced_fields
-from rtd3jax.envs.compat.from_gymnasium import simulator_state
+from rtd3jax.envs.compat.from_gymnasium import simulator_state, with_simulator
 from rtd3jax.envs.interface import action_bounds, foreign_code
 from rtd3jax.evaluation.rollout import episode_returns
 from rtd3jax.policies.trained import Policy
@@ -399,8 +399,12 @@ def revived(program: Program, lane: Lane, state: LaneState, step: int) -> LaneSt
     """A lane from a checkpoint; a simulator that cannot be brought back begins a fresh episode."""
     env: Any = getattr(program.env, "base", program.env)
     simulator = simulator_state(state.env_state)
-    if simulator is None or int(state.failure) != HEALTHY or env.goes_on(simulator):
+    if simulator is None or int(state.failure) != HEALTHY:
         return state
+    found = env.restored(simulator)
+    if found is not None:
+        there = with_simulator(state.env_state, found)
+        return dataclasses.replace(state, env_state=there)
     root = jax.random.key(lane.seed)
     key = jax.random.fold_in(jax.random.fold_in(root, _REVIVED), step)
     observation, env_state = program._reset(key, lane)
@@ -411,6 +415,9 @@ def revived(program: Program, lane: Lane, state: LaneState, step: int) -> LaneSt
         previous_action=jnp.zeros_like(state.previous_action),
         episode_step=jnp.zeros_like(state.episode_step),
         carry=jax.tree.map(jnp.zeros_like, state.carry),
+        metrics=dataclasses.replace(
+            state.metrics, episode_return=jnp.zeros_like(state.metrics.episode_return)
+        ),
     )
 
 

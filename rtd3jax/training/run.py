@@ -10,7 +10,11 @@ import jax
 import numpy as np
 
 from rtd3jax.config import Config
-from rtd3jax.envs.compat.from_gymnasium import simulator_state
+from rtd3jax.envs.compat.from_gymnasium import (
+    is_simulated,
+    simulated_identity,
+    simulator_state,
+)
 from rtd3jax.envs.compat.simulator import fault_of
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import describe
@@ -219,11 +223,14 @@ def _checkpoints(
     seconds: float | None,
 ) -> Checkpoints:
     world = {"env": str(getattr(env, "name", type(env).__name__)), "params": None}
+    if is_simulated(env):  # what is seen of it, and with what it was made
+        world["env"] = simulated_identity(env)
 
     def identity(job: Job) -> dict[str, Any]:
         index, seed = job.key
         params = [named_numbers(leaf) for leaf in jax.tree.leaves(job.lane.env_params)]
-        return {**configs[index].to_dict(), **world, "params": params, "seed": seed}
+        own = {"start": job.start.where} if job.start is not None else {}
+        return {**configs[index].to_dict(), **own, **world, "params": params, "seed": seed}
 
     return Checkpoints(lambda job: directories[job.cell] / f"seed-{job.seed}", identity, seconds)
 
@@ -288,20 +295,13 @@ def _starts(start: StartLike, seeds: tuple[int, ...]) -> dict[int, Start]:
         name = f"a policy of {start.algorithm} ({digest.hexdigest()[:12]})"
         return dict.fromkeys(seeds, Start(name, start))
     if isinstance(start, Run):
-        found = {seed: _starts(start.policy(seed), seeds)[seed] for seed in seeds}
-        name = f"a run of {start.config.algorithm} ({_joint(found)})"
-        return {seed: dataclasses.replace(own, where=name) for seed, own in found.items()}
+        return {seed: _starts(start.policy(seed), (seed,))[seed] for seed in seeds}
     if isinstance(start, str | Path):
         return starts_of_path(start, seeds)
     raise UserError(
         "start must be a policy, a run of rtd.train, the path of a saved policy or a directory of "
         f"checkpoints, not {start!r}"
     )
-
-
-def _joint(starts: Mapping[int, Start]) -> str:
-    names = "".join(start.where for start in starts.values())
-    return hashlib.sha256(names.encode()).hexdigest()[:12]
 
 
 def collect(

@@ -15,12 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from rtd3jax.agents.normalise import Normaliser, Statistics
+from rtd3jax.config import Config
 from rtd3jax.errors import UserError
 from rtd3jax.policies.serialization import read_policy
 from rtd3jax.policies.trained import Policy
 from rtd3jax.system.files import read_arrays, user_path
 from rtd3jax.training.checkpoint import checkpoint_files, leaves_from_arrays
-from rtd3jax.training.loop import Lane, LaneState, Program
+from rtd3jax.training.loop import HEALTHY, Lane, LaneState, Program
 
 KNOWN_OBSERVATIONS = 1_000
 """What a policy's statistics weigh, in observations, against those that the new lane will see."""
@@ -96,9 +97,10 @@ class Start:
         if program.agent.acting.memory is not None:
             fields.append("memory")
         for name in fields:
-            if there.get(name) != here[name]:
+            before = there.get(name, getattr(Config, name, None))  # it may be older than the field
+            if before != here[name]:
                 raise UserError(
-                    f"{self.where} has {name}={there.get(name)}, and the new training "
+                    f"{self.where} has {name}={before}, and the new training "
                     f"{here[name]}: they must agree"
                 )
 
@@ -106,6 +108,11 @@ class Start:
         assert self.checkpoint is not None
         arrays, about = read_arrays(self.checkpoint)
         identity = about.get("identity") if isinstance(about, dict) else None
+        if int(arrays.get(".failure", HEALTHY)) != HEALTHY:
+            raise UserError(
+                f"{self.where} was lost in training, at step {int(arrays['.failed_at']):,}: no "
+                "training can go on from it"
+            )
         self._compare(identity or {}, program.config.to_dict(), program)
         expected = jax.eval_shape(program.init, lane)
         found = {

@@ -15,7 +15,9 @@ _ZERO = {
 
 def updates_of(config: Config) -> tuple[int, int]:
     """How often the critics and the actor will be updated."""
-    return config.updates, config.updates // config.policy_delay
+    waits = config.updates_before_the_actor
+    actor = config.updates // config.policy_delay - waits // config.policy_delay
+    return config.updates, 0 if "actor" in config.frozen else max(0, actor)
 
 
 def why_untrained(config: Config) -> str | None:
@@ -28,7 +30,12 @@ def why_untrained(config: Config) -> str | None:
             f"({config.learning_starts:,}), so that no update is made and {end}: "
             "raise total_steps or lower learning_starts"
         )
-    if actor == 0:
+    if actor == 0 and "actor" not in config.frozen:
+        if config.updates_before_the_actor:
+            return (
+                f"actor_starts ({config.actor_starts:,}) leaves the actor no update within "
+                f"{config.total_steps:,} steps: lower it, or raise total_steps"
+            )
         return (
             f"policy_delay ({config.policy_delay:,}) is more than the {critics:,} critic updates "
             f"of {config.total_steps:,} steps, so that {end}: "

@@ -117,3 +117,12 @@ def test_files_that_are_something_else(tmp_path):
         read_log(pd.DataFrame({"a": [1j, 2j]}))
     with pytest.raises(UserError, match="columns=.* is for a file or a table"):
         read_log(np.zeros((3, 2)), columns=["left"])
+
+
+def test_a_column_whose_name_holds_the_word_episode():
+    table = pd.DataFrame({"episode": [0, 0, 1, 1], "episode_slip": [0.1, 0.2, 0.3, 0.4]})
+    lengths = [
+        [len(part) for part in read_log(table, columns=columns)]
+        for columns in ("episode_slip", ["episode_slip"])
+    ]
+    assert lengths == [[2, 2], [2, 2]]

@@ -215,6 +215,14 @@ def test_however_it_is_cut_and_whatever_stands_beside_it():
         (dict(replay_capacity=50), "replay_capacity .50. is not a multiple"),
         (dict(update_every=2), "update_every .2. and environments .3.: one must be a multiple"),
         (dict(environments=0), "environments must be at least 1"),
+        (
+            dict(replay="segments", segment_length=4, batch_size=8, learning_starts=9),
+            "learning_starts .9. holds less than a segment of each environment.*= 12",
+        ),
+        (
+            dict(replay="segments", segment_length=4, batch_size=8, replay_capacity=9),
+            "replay_capacity .9. holds less than a segment of each environment",
+        ),
     ],
 )
 def test_what_does_not_go_together_is_refused(changes, message):

@@ -16,6 +16,7 @@ from rtd3jax.study import finish, references
 from rtd3jax.study.derive import derive
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.starts import starts_of
+from rtd3jax.system.files import read_arrays, write_arrays
 from rtd3jax.training.run import make_jobs
 from rtd3jax.training.start import KNOWN_OBSERVATIONS, starts_of_path
 
@@ -135,7 +136,7 @@ def test_each_seed_goes_on_from_its_own_and_with_others_the_same(env, kept):
     assert not _same(fresh.policy(1), alone.policy(1))
     # A Run has the policies alone; its name is part of what checkpoints are of.
     assert (
-        "a run of td3"
+        "a policy of td3"
         in rtd.train(other, _config(total_steps=22), [0, 1], progress=False, start=run).config.start
     )
 
@@ -162,6 +163,21 @@ def test_what_does_not_fit_is_refused_before_compilation(
     start = run.policy(0) if of == "policy" else directory
     with pytest.raises(rtd.UserError, match=message):
         rtd.train(env, _config(**changes), [0], progress=False, start=start)
+
+
+def test_a_lost_lane_is_no_start(env, kept, tmp_path):
+    _, directory = kept
+    shutil.copytree(directory, tmp_path / "lost")
+    (file,) = (tmp_path / "lost" / "seed-0").glob("step-*60.safetensors")
+    arrays, about = read_arrays(file)
+    write_arrays(file, {**arrays, ".failure": np.int32(2), ".failed_at": np.int32(31)}, about)
+    with pytest.raises(rtd.UserError, match="was lost in training, at step 31"):
+        rtd.train(env, _config(), [0], progress=False, start=tmp_path / "lost")
+
+
+def test_an_actor_that_waits_to_the_end_is_named(env):
+    with pytest.warns(UserWarning, match="actor_starts .50. leaves the actor no update"):
+        make_jobs(env, _config(actor_starts=50, total_steps=50), [0])
 
 
 def test_what_is_no_start_is_refused(env, kept, tmp_path):

@@ -5,7 +5,9 @@ is resumed goes on where it was, if the simulator is deterministic.
 """
 
 import dataclasses
+import hashlib
 import math
+import pickle
 from collections.abc import Callable, Iterable
 from typing import Any, Protocol
 
@@ -245,22 +247,31 @@ class FromGymnasium(ValueIdentity, environment.Environment):
     def _seen(self, flat: np.ndarray) -> np.ndarray:
         return flat[self._surface.indices].astype(np.float32)
 
-    def goes_on(self, state: SimulatorState) -> bool:
-        """Whether simulators can be brought to the places of a state, or of several, to the bit."""
+    def restored(self, state: SimulatorState) -> SimulatorState | None:
+        """A state from another process, with simulators of this one at its places, to the bit.
+
+        None where one came to another place, because it is not deterministic. Of a simulator that
+        fails, the next step says so.
+        """
         if state.handle.ndim:
             rows = range(state.handle.shape[0])
-            return all(self.goes_on(jax.tree.map(lambda leaf, k=k: leaf[k], state)) for k in rows)
+            parts = [self.restored(jax.tree.map(lambda leaf, k=k: leaf[k], state)) for k in rows]
+            if any(part is None for part in parts):
+                return None
+            return jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts)
         first, second = np.asarray(state.digest).tolist()
         place = int(state.seed), int(state.time), (first, second)
         past = self._commands(np.asarray(state.actions))
         try:
-            found, simulator = self.fleet.at(int(state.handle), place, past)
-        except Fault:  # the next step meets it, and is lost
-            return True
+            # Handles are a process's own: what this one calls so is another lane's.
+            found, simulator = self.fleet.at(-1, place, past)
+        except Fault as fault:
+            return state.replace(handle=jnp.int32(fault.args[1]))
         if simulator is None:
             self.fleet.release(found)
             say(_other(self.name, place[1]))
-        return simulator is not None
+            return None
+        return state.replace(handle=jnp.int32(found))
 
 
 def _stepped(
@@ -397,6 +408,15 @@ def simulator_state(env_state: object) -> SimulatorState | None:
     return next((part for part in parts if isinstance(part, SimulatorState)), None)
 
 
+def with_simulator(env_state: object, simulator: SimulatorState) -> Any:
+    """An environment's state with another state of its simulator."""
+    return jax.tree.map(
+        lambda part: simulator if isinstance(part, SimulatorState) else part,
+        env_state,
+        is_leaf=lambda part: isinstance(part, SimulatorState),
+    )
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Surface:
     """What the outside of an environment is like."""
@@ -450,20 +470,41 @@ def from_gymnasium(
         raise UserError(f"step_seconds={step_seconds!r} must be a number of seconds above 0")
 
     def make() -> gymnasium.Env:
-        return gymnasium.make(env, **kwargs) if isinstance(env, str) else env(**kwargs)
+        if not isinstance(env, str):
+            return env(**kwargs)
+        limit = {} if max_steps_in_episode is None else {"max_episode_steps": max_steps_in_episode}
+        return gymnasium.make(env, **{**limit, **kwargs})
 
     example = _example(make, env, title)
     try:
         surface, read = _surface(example, title, keep, max_steps_in_episode)
     finally:
         _close(example)
-    key = (env, repr(sorted(kwargs.items())), surface.keep, surface.limit, float(step_seconds))
+    key = (env, _named(kwargs), surface.keep, surface.limit, float(step_seconds))
     if key not in _known:
         _known[key] = Fleet(make, read, float(step_seconds))
     return FromGymnasium(key, title, _known[key], surface)
 
 
 _known: dict[tuple, Fleet] = {}
+
+
+def _named(kwargs: dict[str, Any]) -> str:
+    """Keywords in a form that differs where they do: arrays print a part of themselves alone."""
+    try:
+        code = pickle.dumps(sorted(kwargs.items()))
+    except Exception:  # what cannot be pickled is the same as itself alone
+        return repr([(name, id(value)) for name, value in sorted(kwargs.items())])
+    return hashlib.sha256(code).hexdigest()[:16] if kwargs else ""
+
+
+def simulated_identity(env: object) -> str:
+    """What a simulator's environment was made of, as checkpoints have it."""
+    base = getattr(env, "base", env)
+    assert isinstance(base, FromGymnasium)
+    made, kwargs, keep, limit, _ = base.identity()
+    name = made if isinstance(made, str) else base.name
+    return f"{name} keep={keep} limit={limit} {kwargs}".strip()
 
 
 def _example(make: Callable[[], Any], env: object, title: str) -> gymnasium.Env:

@@ -271,6 +271,42 @@ def test_the_sweep_trains_by_name(tmp_path):
     assert "gymnasium:Pendulum-v1" in (out / "summary.md").read_text("utf-8")
 
 
+def test_a_longer_time_limit_than_the_ids_own():
+    env = rtd.from_gymnasium("Pendulum-v1", max_steps_in_episode=210)
+    step = jax.jit(env.step)
+    _, state = env.reset(jax.random.key(0), env.default_params)
+    for number in range(210):
+        _, state, *_, truncated, _ = step(
+            jax.random.key(1), state, jnp.zeros(1), env.default_params
+        )
+        assert bool(truncated) == (number == 209)
+    close_simulators()
+
+
+def test_tables_that_print_alike_are_two_environments():
+    def make(table):
+        return gymnasium.make("Pendulum-v1")
+
+    one, other = np.zeros(2_000), np.zeros(2_000)
+    other[1_000] = 1.0
+    made = [rtd.from_gymnasium(make, table=table) for table in (one, other, one.copy())]
+    assert made[0] != made[1] and made[0] == made[2]
+
+
+def test_another_lanes_fault_is_not_that_of_a_restored_one():
+    """Handles are numbers of a process: in the next one they belong to others."""
+    env = rtd.from_gymnasium("Pendulum-v1")
+    _, state = env.reset(jax.random.key(0), env.default_params)
+    taken = env.fleet._busy[int(state.handle)]
+    taken.fault = "another lane's"
+    found = env.restored(state)
+    assert int(found.handle) != int(state.handle) and env.fleet.fault(int(found.handle)) is None
+    open_before = env.fleet.count
+    env.step(jax.random.key(1), found, jnp.zeros(1), env.default_params)
+    assert env.fleet.count == open_before  # the restored one is the one that steps
+    close_simulators()
+
+
 def test_one_that_hangs_is_waited_for_once(monkeypatch):
     """It keeps its fault, for the lane's message; every later training would wait for it again."""
 
