@@ -49,7 +49,7 @@ def policy_of(algorithm, length, width, acting):
         history_length=jnp.int32(length),
         centre_token=jnp.zeros(ACTIONS),
         algorithm=algorithm,
-        tokens=length,
+        window_tokens=length,
         observation_size=OBSERVATIONS,
         action_shape=(ACTIONS,),
         acting=acting,

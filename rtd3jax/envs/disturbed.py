@@ -8,7 +8,7 @@ from flax import struct
 from gymnax.environments import environment, spaces
 from jax.typing import ArrayLike
 
-from rtd3jax.envs.compat.from_gymnasium import step_with_reset
+from rtd3jax.envs.compat.from_gymnasium import is_simulated, step_with_reset
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.identity import ValueIdentity, strong
 from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT, describe, foreign_code
@@ -148,7 +148,7 @@ class Disturbed(ValueIdentity, environment.Environment):
         self, key: jax.Array, state: object, action: ArrayLike, params: object = None
     ) -> tuple:
         """One step with automatic reset; a simulator is reset only at an episode's end."""
-        if not hasattr(self.base, "reset_where"):
+        if not is_simulated(self):
             return super().step(key, state, action, params)
         params = self.default_params if params is None else params
         return step_with_reset(self, key, state, action, params)

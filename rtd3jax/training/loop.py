@@ -30,7 +30,7 @@ from rtd3jax.agents.replay import (
     store,
 )
 from rtd3jax.config import Config, traced_fields
-from rtd3jax.envs.compat.from_gymnasium import simulator_state, with_simulator
+from rtd3jax.envs.compat.from_gymnasium import innermost, simulator_state, with_simulator
 from rtd3jax.envs.interface import action_bounds, foreign_code
 from rtd3jax.evaluation.rollout import episode_returns
 from rtd3jax.policies.trained import Policy
@@ -397,7 +397,7 @@ class Program:
 
 def revived(program: Program, lane: Lane, state: LaneState, step: int) -> LaneState:
     """A lane from a checkpoint; a simulator that cannot be brought back begins a fresh episode."""
-    env: Any = getattr(program.env, "base", program.env)
+    env: Any = innermost(program.env)
     simulator = simulator_state(state.env_state)
     if simulator is None or int(state.failure) != HEALTHY:
         return state

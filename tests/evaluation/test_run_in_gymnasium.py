@@ -72,7 +72,7 @@ def test_a_recurrent_policy_plays_with_its_window():
         history_length=jnp.int32(2),
         centre_token=jnp.zeros(1),
         algorithm="lstm-td3-1ha1hc",
-        tokens=2,
+        window_tokens=2,
         observation_size=3,
         action_shape=(1,),
     )

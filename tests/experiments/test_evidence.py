@@ -201,6 +201,7 @@ def test_the_pendulum_experiment_runs(tmp_path, capsys, monkeypatch):
     assert (out / "pendulum_swing.gif").read_bytes().startswith(b"GIF")
 
 
+@pytest.mark.slow
 def test_pairs_of_precisions_are_compared(tmp_path):
     pairs = load(EXPERIMENTS / "bfloat16_returns.py")
     options = ["--quick", "--run", str(tmp_path / "run"), "--out", str(tmp_path)]

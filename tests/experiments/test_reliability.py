@@ -16,6 +16,7 @@ def load(path):
     return module
 
 
+@pytest.mark.slow
 def test_random_configurations_and_command_lines(capsys):
     assert load(EXPERIMENTS / "reliability" / "fuzz.py").main(["--quick"]) == 0
     assert "command lines run" in capsys.readouterr().out

@@ -84,6 +84,7 @@ def noisy_waves(logs, episodes):
     return slip + 0.02 * np.random.default_rng(0).standard_normal(slip.shape)
 
 
+@pytest.mark.slow
 def test_waves_are_found():
     logs = noisy_waves(30, 6)
     fits = [rtd.fit_process(log, "sine", max_slip=1.0) for log in logs]

@@ -7,6 +7,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 
 def final_return(code):
     """The mean return at the end of the two lanes of ``run``, which ``code`` trains."""
@@ -22,6 +24,7 @@ def final_return(code):
     return float(done.stdout)
 
 
+@pytest.mark.slow
 def test_td3_swings_up_the_fully_observable_pendulum():
     code = """
 config = rtd.Config(algorithm="td3", total_steps=15_000, eval_every=5_000)

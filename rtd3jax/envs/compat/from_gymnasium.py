@@ -382,15 +382,22 @@ def without_handles(tree: object) -> Any:
     return jax.tree.map(plain, tree, is_leaf=lambda part: isinstance(part, SimulatorState))
 
 
+def innermost(env: object) -> object:
+    """The environment below all disturbances."""
+    while hasattr(env, "base"):
+        env = env.base
+    return env
+
+
 def is_simulated(env: object) -> bool:
     """Whether a simulator on the host plays the environment, disturbed or not."""
-    return isinstance(getattr(env, "base", env), FromGymnasium)
+    return isinstance(innermost(env), FromGymnasium)
 
 
 def release(env: object, env_state: object) -> None:
     """Within a program: the simulators of a state, or of several, are free for other episodes."""
     states = jax.tree.leaves(env_state, is_leaf=lambda part: isinstance(part, SimulatorState))
-    base = getattr(env, "base", env)
+    base = innermost(env)
     for state in states:
         if isinstance(state, SimulatorState) and isinstance(base, FromGymnasium):
             fleet = base.fleet
@@ -500,7 +507,7 @@ def _named(kwargs: dict[str, Any]) -> str:
 
 def simulated_identity(env: object) -> str:
     """What a simulator's environment was made of, as checkpoints have it."""
-    base = getattr(env, "base", env)
+    base = innermost(env)
     assert isinstance(base, FromGymnasium)
     made, kwargs, keep, limit, _ = base.identity()
     name = made if isinstance(made, str) else base.name

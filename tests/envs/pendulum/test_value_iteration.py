@@ -35,6 +35,7 @@ def test_the_mean_over_starts_is_that_of_many_random_starts():
     assert mean_over_starts(value, 2.5) == pytest.approx(sample.mean(), abs=4 * error)
 
 
+@pytest.mark.slow
 def test_the_grids_error_covers_what_a_finer_grid_says():
     """-136.98 is what 400 x 320 and 800 x 640 say; test_finer_grids_agree computes it."""
     mean, error = mean_optimal_return(_params(), ANGLES, SPEEDS)
