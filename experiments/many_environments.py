@@ -14,12 +14,12 @@ import time
 
 import numpy as np
 import pandas as pd
-from scipy import stats
 
 import rtd3jax as rtd
 from rtd3jax.study.presets import ROVER_HISTORY_LENGTH, ROVER_SETTINGS, ROVER_STEPS
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
+from bfloat16_returns import interval  # noqa: E402
 from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
 
 AGENT, DISTURBANCE, COUNTS, EPISODES, SEEDS = "lstm-td3-1ha1hc", "ar1-slip", (1, 16), 1_000, 5
@@ -65,7 +65,7 @@ def main(arguments: list[str] | None = None) -> int:
     table = pd.DataFrame(rows)
     one, many = (table[table["environments"] == count] for count in COUNTS)
     differences = many["mean"].to_numpy() - one["mean"].to_numpy()
-    reach = stats.t.ppf(0.975, len(differences) - 1) * stats.sem(differences)
+    mean, low, high = interval(differences)
     share = many["seconds"].mean() / one["seconds"].mean()
     body = [
         [
@@ -78,8 +78,7 @@ def main(arguments: list[str] | None = None) -> int:
     ]
     text = markdown_table(["environments", "return", "seconds a lane", "updates"], body)
     text += (
-        f"\n\nDifference of pairs {differences.mean():+.3f} "
-        f"[{differences.mean() - reach:+.3f}, {differences.mean() + reach:+.3f}] (95%); "
+        f"\n\nDifference of pairs {mean:+.3f} [{low:+.3f}, {high:+.3f}] (95%); "
         f"{share:.2f} of the time.\n"
     )
     steps = tiny.get("total_steps", ROVER_STEPS)

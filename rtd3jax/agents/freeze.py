@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
 from rtd3jax.agents.memory.base import Params
-from rtd3jax.agents.networks import Network
+from rtd3jax.agents.networks import LAYERS, Network
 from rtd3jax.errors import UserError, nearest
 
 State = TypeVar("State")
@@ -25,9 +25,6 @@ def check_parts(parts: Sequence[str], networks: Mapping[str, Network]) -> None:
                 f"freeze: {whose} has no layer {layer!r}{nearest(layer, layers)}; its layers are "
                 f"{', '.join(layers)}"
             )
-
-
-LAYERS = ("encoder", "memory", "current", "head", "output")
 
 
 def frozen_parts(before: State, after: State, parts: Sequence[str]) -> State:

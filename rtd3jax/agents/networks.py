@@ -19,6 +19,9 @@ from rtd3jax.agents.products import matmul
 from rtd3jax.errors import UserError, first_line
 from rtd3jax.registries import MEMORIES
 
+LAYERS = ("encoder", "memory", "current", "head", "output")
+"""The modules of a network, in the order in which their keys are drawn."""
+
 
 @dataclasses.dataclass(frozen=True)
 class NetworkSpec:
@@ -220,10 +223,9 @@ def make_network(
 
 def init_network(key: jax.Array, network: Network) -> Params:
     """Parameters of ``network`` at the start of training, under the names of its fields."""
-    names = ("encoder", "memory", "current", "head", "output")
-    keys = dict(zip(names, jax.random.split(key, len(names)), strict=True))
+    keys = dict(zip(LAYERS, jax.random.split(key, len(LAYERS)), strict=True))
     params: Params = {}
-    for name in names:
+    for name in LAYERS:
         module = getattr(network, name)
         if module is not None:
             params[name] = _initial(module, keys[name])

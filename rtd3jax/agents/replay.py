@@ -22,9 +22,7 @@ from rtd3jax.agents.history import (
     empty_steps,
     flat,
     next_window,
-    put_row,
     put_rows,
-    put_step,
     segment_at,
     window_at,
 )
@@ -146,26 +144,18 @@ def present_window(
     )
 
 
-def put_transition(replay: Replay, step_number: jax.Array, row: Transition) -> Replay:
-    """The ring after step ``step_number`` (int32 [])."""
+def put_transitions(replay: Replay, first: jax.Array, rows: Transition) -> Replay:
+    """The ring with the K environments' ``rows`` (leaves [K, ...]) from step ``first`` on."""
     kept = replay.transitions
-    slot = step_number % kept.reward.shape[0]
-    return dataclasses.replace(
-        replay,
-        transitions=Transition(
-            step=put_step(kept.step, step_number, row.step),
-            reward=put_row(kept.reward, slot, row.reward),
-            next_observation=put_row(kept.next_observation, slot, row.next_observation),
-            terminated=put_row(kept.terminated, slot, row.terminated),
-            episode_step=put_row(kept.episode_step, slot, row.episode_step),
-        ),
-    )
+    slot = first % kept.reward.shape[0]
+    written = jax.tree.map(lambda ring, new: put_rows(ring, slot, new), kept, rows)
+    return dataclasses.replace(replay, transitions=written)
 
 
-def put_carry(replay: Replay, step_number: jax.Array, carry: Carry) -> Replay:
-    """The ring with the behaviour actor's carry (leaves [...]) before step ``step_number``."""
-    slot = _carry_slot(replay.carries, step_number)
-    carries = jax.tree.map(lambda kept, row: put_row(kept, slot, row), replay.carries, carry)
+def put_carries(replay: Replay, first: jax.Array, rows: Carry) -> Replay:
+    """The ring with the actor's carries (leaves [K, ...]) before the steps from ``first`` on."""
+    slot = _carry_slot(replay.carries, first)
+    carries = jax.tree.map(lambda kept, new: put_rows(kept, slot, new), replay.carries, rows)
     return dataclasses.replace(replay, carries=carries)
 
 
@@ -178,14 +168,15 @@ def keep_acting_carry(
     """
     if replay.carries is None:
         return replay
-    slot = _carry_slot(replay.carries, step * replay.environments)
+    first = step * replay.environments
+    slot = _carry_slot(replay.carries, first)
 
     def rows(kept: jax.Array, new: jax.Array) -> jax.Array:
         there = jax.lax.dynamic_slice_in_dim(kept, slot, replay.environments, axis=0)
-        first = (episode_step == 0).reshape(-1, *[1] * (new.ndim - 1))
-        return jnp.where(first, there, new)
+        begins = (episode_step == 0).reshape(-1, *[1] * (new.ndim - 1))
+        return jnp.where(begins, there, new)
 
-    return _put_carries(replay, slot, jax.tree.map(rows, replay.carries, carry))
+    return put_carries(replay, first, jax.tree.map(rows, replay.carries, carry))
 
 
 def store(
@@ -208,10 +199,7 @@ def store(
         never: bool [], false, computed from what the updates read; see `_after`.
     """
     first = _after(step, never) * replay.environments
-    kept = replay.transitions
-    slot = first % kept.reward.shape[0]
-    written = jax.tree.map(lambda ring, new: put_rows(ring, slot, new), kept, rows)
-    replay = dataclasses.replace(replay, transitions=written)
+    replay = put_transitions(replay, first, rows)
     if replay.carries is None:
         return replay
     # Within an episode the next step's own carry takes this slot.
@@ -223,13 +211,7 @@ def store(
             replay.carries,
         ),
     )
-    slot = _carry_slot(replay.carries, first + replay.environments)
-    return _put_carries(replay, slot, carry)
-
-
-def _put_carries(replay: Replay, slot: jax.Array, rows: Carry) -> Replay:
-    carries = jax.tree.map(lambda kept, new: put_rows(kept, slot, new), replay.carries, rows)
-    return dataclasses.replace(replay, carries=carries)
+    return put_carries(replay, first + replay.environments, carry)
 
 
 @jax.custom_batching.custom_vmap

@@ -29,11 +29,13 @@ def add_starts(directory: RunDirectory, jobs: Sequence[Job], *, write: bool) -> 
         if not checkpoint_files(directory.lanes.checkpoint_directory(*job.key)):
             by_cell.setdefault(job.cell, []).append(job)
     for cell, own in by_cell.items():
-        starts = starts_of(cell, [job.seed for job in own])
-        for job in own:
+        new = [job for job in own if job.start is None]
+        starts = starts_of(cell, [job.seed for job in new])
+        for job in new:
             job.start = starts[job.seed]
             job.start.check(job.program, job.lane)
-            if write:
+        for job in own:
+            if write and job.start is not None:
                 directory.lanes.write_start(cell, job.seed, job.start.about)
 
 
@@ -61,12 +63,9 @@ def _start(directory: RunDirectory, cell: Cell, seed: int, disturbance: str) -> 
         if (other.config.algorithm, other.config.memory) == (config.algorithm, config.memory)
         and disturbance in ("", other.disturbance)
     ]
-    for alike in (
-        [c for c in fitting if c.config.history_length == config.history_length],
-        [c for c in fitting if c.env == cell.env],
-    ):
-        both = [c for c in fitting if c in alike]
-        fitting = both or fitting
+    same_length = [c for c in fitting if c.config.history_length == config.history_length]
+    fitting = same_length or fitting
+    fitting = [c for c in fitting if c.env == cell.env] or fitting
     wanted = f"{config.algorithm}{f' under {disturbance}' if disturbance else ''}"
     if not fitting:
         there = dict.fromkeys(

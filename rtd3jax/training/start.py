@@ -33,12 +33,12 @@ class Start:
 
     Attributes:
         where: what it is, for people.
-        policy: the trained policy, where that is all there is; a file of one is read when needed.
+        policy: the trained policy, where that is all there is.
         checkpoint: the file of a lane that has more; None otherwise.
     """
 
     where: str
-    policy: Policy | Path | None = None
+    policy: Policy | None = None
     checkpoint: Path | None = None
 
     @property
@@ -55,7 +55,8 @@ class Start:
         """
         if self.checkpoint is not None:
             return self._whole(program, lane, state)
-        policy = self.policy if isinstance(self.policy, Policy) else read_policy(self.where)
+        policy = self.policy
+        assert policy is not None
         self._check(program, policy)
         statistics = state.statistics
         if policy.normaliser is not None:

@@ -4,8 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flax import struct
-from gymnax.environments import environment, spaces
+from follow import Follow, Params
 
 import rtd3jax as rtd
 from rtd3jax.agents.history import flat
@@ -43,38 +42,6 @@ def test_an_element_that_does_not_change_is_centred_only(rows):
 def test_an_outlier_is_cut_off():
     normaliser = _statistics(np.random.default_rng(0).normal(size=(100, 1))).normaliser()
     np.testing.assert_allclose(normaliser(jnp.asarray([[1e9], [-1e9]])), [[LIMIT], [-LIMIT]])
-
-
-class Params(struct.PyTreeNode):
-    """The units and zeros of the sensors are parameters: one program serves them all."""
-
-    max_steps_in_episode: int = 20
-    unit: jax.Array | tuple = (1.0, 1.0, 1.0)
-
-
-class State(struct.PyTreeNode):
-    time: jax.Array
-    x: jax.Array
-
-
-class Follow(environment.Environment):
-    """Reward: minus the squared distance of each action from what the sensors see."""
-
-    @property
-    def default_params(self):
-        return Params()
-
-    def reset_env(self, key, params):
-        x = jax.random.uniform(key, (3,), jnp.float32, -1, 1)
-        return x * params.unit, State(jnp.int32(0), x)
-
-    def step_env(self, key, state, action, params):
-        reward = -jnp.sum(jnp.square(action - state.x[:2]))
-        new = State(state.time + 1, 0.9 * state.x)
-        return new.x * params.unit, new, reward, jnp.asarray(False), {}
-
-    def action_space(self, params=None):
-        return spaces.Box(-1, 1, (2,))
 
 
 ENV = Follow()

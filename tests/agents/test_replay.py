@@ -12,8 +12,8 @@ from rtd3jax.agents.replay import (
     Transition,
     empty_replay,
     gather,
-    put_carry,
-    put_transition,
+    put_carries,
+    put_transitions,
     sample,
 )
 
@@ -43,21 +43,23 @@ def _store(rows, capacity):
     replay = empty_replay(capacity, 2, 1, zero_carry(1, 1))
     for number, row in enumerate(rows):
         if row["episode_step"]:
-            replay = put_carry(replay, jnp.int32(number), _carry(row["observation"]))
+            replay = put_carries(replay, jnp.int32(number), _row(_carry(row["observation"])))
         array = {k: jnp.asarray(v, jnp.float32) for k, v in row.items()}
-        replay = put_transition(
-            replay,
-            jnp.int32(number),
-            Transition(
-                step=Steps(array["observation"], array["previous_action"], array["action"]),
-                reward=array["reward"],
-                next_observation=array["next_observation"],
-                terminated=jnp.asarray(row["terminated"]),
-                episode_step=jnp.int32(row["episode_step"]),
-            ),
+        transition = Transition(
+            step=Steps(array["observation"], array["previous_action"], array["action"]),
+            reward=array["reward"],
+            next_observation=array["next_observation"],
+            terminated=jnp.asarray(row["terminated"]),
+            episode_step=jnp.int32(row["episode_step"]),
         )
-        replay = put_carry(replay, jnp.int32(number + 1), _carry(row["next_observation"]))
+        replay = put_transitions(replay, jnp.int32(number), _row(transition))
+        replay = put_carries(replay, jnp.int32(number + 1), _row(_carry(row["next_observation"])))
     return replay
+
+
+def _row(leaves):
+    """Of the one environment."""
+    return jax.tree.map(lambda leaf: leaf[None], leaves)
 
 
 def _carry(observation):

@@ -19,8 +19,8 @@ from rtd3jax.agents.replay import (
     empty_replay,
     gather,
     gather_segments,
-    put_carry,
-    put_transition,
+    put_carries,
+    put_transitions,
     sample_segments,
 )
 from rtd3jax.registries import AGENTS
@@ -46,7 +46,7 @@ def _ring(agent, memory="lstm"):
     def draw(*shape):
         return jnp.asarray(random.uniform(-1, 1, shape), jnp.float32)
 
-    put, put_next = jax.jit(put_transition), jax.jit(put_carry)
+    put, put_next = jax.jit(put_transitions), jax.jit(put_carries)
     for episode, length in enumerate(LENGTHS):
         observation, previous = draw(OBSERVATION), jnp.zeros(ACTION)
         for episode_step in range(length):
@@ -59,9 +59,10 @@ def _ring(agent, memory="lstm"):
                 terminated=jnp.asarray(last and episode % 2 == 0),
                 episode_step=jnp.int32(episode_step),
             )
-            replay = put(replay, jnp.int32(number), row)
+            one = jax.tree.map(lambda leaf: leaf[None], row)
+            replay = put(replay, jnp.int32(number), one)
             if carry is not None:
-                own = jax.tree.map(lambda leaf: draw(*leaf.shape[1:]), carry)
+                own = jax.tree.map(lambda leaf: draw(*leaf.shape[1:])[None], carry)
                 replay = put_next(replay, jnp.int32(number + 1), own)
             observation, previous, number = after, action, number + 1
     return replay, number

@@ -13,7 +13,7 @@ from rtd3jax.agents.hyperparameters import Hyperparameters
 from rtd3jax.agents.learners import td3
 from rtd3jax.agents.learners.base import Networks
 from rtd3jax.agents.memory.lstm import Carry, zero_carry
-from rtd3jax.agents.replay import Transition, empty_replay, gather, put_carry, put_transition
+from rtd3jax.agents.replay import Transition, empty_replay, gather, put_carries, put_transitions
 from rtd3jax.agents.variants import ALGORITHMS
 from rtd3jax.registries import AGENTS
 
@@ -58,8 +58,8 @@ def replays():
             jnp.asarray(terminated),
             jnp.int32(episode_step),
         )
-        ours = put_transition(ours, jnp.int32(number), row)
-        ours = put_carry(ours, jnp.int32(number), Carry(*map(jnp.asarray, carry)))
+        ours = put_transitions(ours, jnp.int32(number), jax.tree.map(lambda x: x[None], row))
+        ours = put_carries(ours, jnp.int32(number), Carry(*map(jnp.asarray, carry[:, None])))
         theirs.put(previous, observation, action, float(number), after, terminated, episode_step)
         theirs.put_carry(number, carry)
     return ours, theirs

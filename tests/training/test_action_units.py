@@ -4,46 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flax import struct
-from gymnax.environments import environment, spaces
+from follow import Follow, Params
 
 import rtd3jax as rtd
-
-
-class Params(struct.PyTreeNode):
-    """The range of the actions is a parameter, so that one program serves every unit."""
-
-    max_steps_in_episode: int = 20
-    centre: jax.Array | tuple = (0.0, 0.0)
-    half_range: jax.Array | tuple = (1.0, 1.0)
-
-
-class State(struct.PyTreeNode):
-    time: jax.Array
-    x: jax.Array
-
-
-class Follow(environment.Environment):
-    """Reward: minus the squared distance of each action, in half ranges, from what is seen."""
-
-    @property
-    def default_params(self):
-        return Params()
-
-    def reset_env(self, key, params):
-        x = jax.random.uniform(key, (3,), jnp.float32, -1, 1)
-        return x, State(jnp.int32(0), x)
-
-    def step_env(self, key, state, action, params):
-        action = (action - params.centre) / params.half_range
-        reward = -jnp.sum(jnp.square(action - state.x[:2]))
-        new = State(state.time + 1, 0.9 * state.x)
-        return new.x, new, reward, jnp.asarray(False), {}
-
-    def action_space(self, params=None):
-        centre, half_range = jnp.asarray(params.centre), jnp.asarray(params.half_range)
-        return spaces.Box(centre - half_range, centre + half_range, (2,))
-
 
 ENV = Follow()
 

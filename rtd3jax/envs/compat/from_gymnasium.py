@@ -20,7 +20,7 @@ from gymnax.environments import environment, spaces
 from jax.experimental import io_callback
 from jax.typing import ArrayLike
 
-from rtd3jax.envs.compat.simulator import Fault, Fleet, Simulator, say
+from rtd3jax.envs.compat.simulator import Fault, Fleet, faults_of, say
 from rtd3jax.envs.identity import ValueIdentity
 from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT
 from rtd3jax.errors import UserError, first_line, nearest
@@ -219,13 +219,13 @@ class FromGymnasium(ValueIdentity, environment.Environment):
         past: np.ndarray,
     ) -> tuple:
         """On the host."""
-        first, second = digest.tolist()
-        place = int(seed), int(time), (first, second)
+        place = _place(seed, time, digest)
         try:
             found, simulator = self.fleet.at(int(handle), place, self._commands(past))
             if simulator is None:
                 raise Fault(_other(self.name, place[1]), found)
-            flat, reward, terminated, truncated = _stepped(simulator, self._command(action), found)
+            with faults_of(found):
+                flat, reward, terminated, truncated = simulator.step(self._command(action))
         except Fault as fault:
             _report(self.name, fault)
             number, lost = np.int32(fault.args[1]), np.float32(np.nan)
@@ -259,8 +259,7 @@ class FromGymnasium(ValueIdentity, environment.Environment):
             if any(part is None for part in parts):
                 return None
             return jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts)
-        first, second = np.asarray(state.digest).tolist()
-        place = int(state.seed), int(state.time), (first, second)
+        place = _place(state.seed, state.time, state.digest)
         past = self._commands(np.asarray(state.actions))
         try:
             # Handles are a process's own: what this one calls so is another lane's.
@@ -274,13 +273,10 @@ class FromGymnasium(ValueIdentity, environment.Environment):
         return state.replace(handle=jnp.int32(found))
 
 
-def _stepped(
-    simulator: Simulator, action: np.ndarray, handle: int
-) -> tuple[np.ndarray, float, bool, bool]:
-    try:
-        return simulator.step(action)
-    except Fault as fault:
-        raise Fault(str(fault), handle) from fault
+def _place(seed: ArrayLike, time: ArrayLike, digest: ArrayLike) -> tuple[int, int, tuple[int, int]]:
+    """Where a simulator is to be, as `Fleet.at` has it."""
+    first, second = np.asarray(digest).tolist()
+    return int(np.asarray(seed)), int(np.asarray(time)), (first, second)
 
 
 def _other(name: str, steps: int) -> str:

@@ -12,7 +12,7 @@ import itertools
 import queue
 import threading
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -166,6 +166,15 @@ def _digest(before: Sequence[int], observation: np.ndarray, reward: float) -> tu
     return int(first), int(second)
 
 
+@contextlib.contextmanager
+def faults_of(handle: int) -> Iterator[None]:
+    """A fault within has the simulator's handle as its second argument."""
+    try:
+        yield
+    except Fault as fault:
+        raise Fault(str(fault), handle) from fault
+
+
 class Fleet:
     """All simulators of one environment in this process; every method may be called by any thread.
 
@@ -191,10 +200,8 @@ class Fleet:
             Fault: with the simulator's handle as its second argument.
         """
         handle, simulator = self._take(handle)
-        try:
+        with faults_of(handle):
             observation = simulator.reset(seed)
-        except Fault as fault:
-            raise Fault(str(fault), handle) from fault
         assert simulator.place is not None
         return handle, observation, simulator.place[2]
 
@@ -217,12 +224,10 @@ class Fleet:
                     self._busy[handle] = self._busy.pop(handle)
                     return handle, simulator
         handle, simulator = self._take(-1)
-        try:
+        with faults_of(handle):
             simulator.reset(place[0])
             for action in past(place[1]):
                 simulator.step(action)
-        except Fault as fault:
-            raise Fault(str(fault), handle) from fault
         return handle, simulator if simulator.place == place else None
 
     def release(self, handle: int) -> None:

@@ -112,16 +112,8 @@ def _build(graph: _Graph, model: Model) -> None:
             features.append(_row(graph, carry[0], length))
             carry = [_rows(graph, part, length) for part in carry]
     if model.current:
-        features.append(
-            graph.add(
-                "Relu",
-                [
-                    graph.linear(
-                        "current", graph.join(_named(model.current, observation=observation))
-                    )
-                ],
-            )
-        )
+        parts = graph.join(_named(model.current, observation=observation))
+        features.append(graph.add("Relu", [graph.linear("current", parts)]))
     head = graph.add("Relu", [graph.linear("head", graph.join(features))])
     token = graph.add("Tanh", [graph.linear("output", head)], "action_token")
     scaled = graph.add("Mul", [token, graph.weight("action_half_range")])
