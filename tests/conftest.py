@@ -1,17 +1,19 @@
 """Strictness for every test, and a cache of compiled programs."""
 
+import functools
 import os
 import pathlib
 
 import hypothesis
 import jax
 import matplotlib
+import pytest
+from compiling import QUICK_TO_COMPILE
 
-# Read when JAX's backend starts, here and in the processes that tests start: nearly all of the
-# suite's time is compiling, and code that is not optimised takes half as long to compile.
-_LEVEL = "--xla_backend_optimization_level"
-if _LEVEL not in os.environ.get("XLA_FLAGS", ""):
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_LEVEL}=0".strip()
+# Read when JAX's backend starts, here and in the processes that tests start.
+for _name, _value in QUICK_TO_COMPILE.items():
+    if _name not in os.environ.get("XLA_FLAGS", ""):
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_name}={_value}".strip()
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -25,3 +27,13 @@ hypothesis.settings.register_profile(
 hypothesis.settings.load_profile("rtd3jax")
 
 matplotlib.use("Agg")
+
+
+@pytest.fixture(autouse=True, scope="session")
+def ceilings_of_few_episodes():
+    """The ceilings in a study's tables and figures are means of 100 episodes, not of 20,000."""
+    from rtd3jax.study import ceilings
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ceilings, "ceiling", functools.partial(ceilings.ceiling, episodes=100))
+        yield

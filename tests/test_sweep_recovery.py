@@ -73,13 +73,14 @@ def one_step_chunks(monkeypatch):
 
 # A process that dies, as from SIGKILL, when it is about to move the file of this name.
 DYING = """
-import os, signal, sys
+import functools, os, signal, sys
 from rtd3jax import sweep
-from rtd3jax.study import references
+from rtd3jax.study import ceilings, references
 from rtd3jax.system import files
 from rtd3jax.training import lanes
 
 references.EPISODES = 2
+ceilings.ceiling = functools.partial(ceilings.ceiling, episodes=100)
 lanes._FIRST_CHUNK, lanes.CHUNK_SECONDS = 40, 0.0
 part, times = sys.argv[1], int(sys.argv[2])
 real = os.replace

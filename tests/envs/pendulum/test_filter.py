@@ -13,8 +13,8 @@ from rtd3jax.envs.pendulum.value_iteration import swing
 
 @pytest.fixture(autouse=True)
 def coarse_grid(monkeypatch):
-    monkeypatch.setattr(pendulum_filter, "ANGLES", 100)
-    monkeypatch.setattr(pendulum_filter, "SPEEDS", 80)
+    monkeypatch.setattr(pendulum_filter, "ANGLES", 60)
+    monkeypatch.setattr(pendulum_filter, "SPEEDS", 48)
 
 
 def _posterior_moments(env, torques, observations):
