@@ -19,6 +19,7 @@ from rtd3jax.envs.identity import ValueIdentity
 from rtd3jax.envs.pendulum.filter import filter_policy
 from rtd3jax.envs.processes.disturbances import DampedSine, GaussianNoise, Hidden, Pulses, Sine
 from rtd3jax.envs.processes.faults import Delay, Dropout, GainDrift, OrnsteinUhlenbeck, Quantisation
+from rtd3jax.envs.processes.mixture import Mixture
 from rtd3jax.envs.processes.process import Chain, NoDisturbance, Nothing, Process, Sum
 from rtd3jax.envs.processes.recorded import Recorded
 from rtd3jax.envs.registry import make, register
@@ -60,6 +61,7 @@ __all__ = [
     "GaussianNoise",
     "Hidden",
     "Memory",
+    "Mixture",
     "NetworkSpec",
     "NoDisturbance",
     "Nothing",

@@ -13,6 +13,7 @@ from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.identity import ValueIdentity, strong
 from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT, describe, foreign_code
 from rtd3jax.envs.processes.disturbances import Hidden
+from rtd3jax.envs.processes.mixture import Mixture
 from rtd3jax.envs.processes.process import Chain, NoDisturbance, Process
 from rtd3jax.errors import UserError, nearest
 from rtd3jax.protocols import ComposableEnvironment, EnvironmentLike
@@ -313,11 +314,20 @@ def seen_elements(env: EnvironmentLike, params: Any, size: int) -> list[int]:
     another number of elements than are returned, nobody knows which they are.
     """
     elements = list(range(size))
-    if isinstance(env, Disturbed):
-        process = params.observation
-        for part in process.processes if isinstance(process, Chain) else (process,):
-            if isinstance(part, Hidden):
-                del elements[part.element]
+    return _left(params.observation, elements) if isinstance(env, Disturbed) else elements
+
+
+def _left(process: Process, elements: list[int]) -> list[int]:
+    """Those of ``elements`` that ``process`` does not remove."""
+    if isinstance(process, Hidden):
+        return [*elements[: process.element], *elements[process.element + 1 :]]
+    if isinstance(process, Chain):
+        for part in process.processes:
+            elements = _left(part, elements)
+    if isinstance(process, Mixture):
+        each = [_left(member, elements) for member in process.processes]
+        # Members that remove different elements leave columns without one meaning.
+        return each[0] if all(left == each[0] for left in each) else []
     return elements
 
 

@@ -32,6 +32,7 @@ from rtd3jax.envs.processes.faults import (
     OrnsteinUhlenbeck,
     Quantisation,
 )
+from rtd3jax.envs.processes.mixture import Mixture
 from rtd3jax.envs.processes.process import NoDisturbance, Process, require
 from rtd3jax.errors import UserError, nearest
 from rtd3jax.protocols import EnvironmentLike
@@ -89,7 +90,8 @@ def make(env_id: str, disturbance: str = "none", **parameters: Any) -> Any:
         env_id: one of ``ENVIRONMENTS``, a registered id, a gymnax id, or ``gymnasium:`` and an id
             of Gymnasium's.
         disturbance: an id, or several joined by ``+``. Those that disturb the same thing act in
-            that order.
+            that order. Alternatives are separated by ``/``: each episode draws one of them (see
+            `rtd3jax.Mixture`; ``weights=(2,1)`` draws the first twice as often).
         **parameters: fields of a disturbance, else of the environment's parameters. An environment
             with ``observed_reward`` also has ``reward_from`` ("state" or "observation"). Its
             default is "state", but for ``noise`` of the pendulum, as the paper has it [choice].
@@ -300,34 +302,40 @@ def parse_disturbance(text: str) -> tuple[str, dict[str, Any]]:
     return disturbance.strip(), parameters
 
 
-def _lookup(env_id: str, entry: _Entry, disturbance: str) -> list[tuple[str, Process]]:
-    """Channel and process of each part of ``disturbance``."""
+def _lookup(env_id: str, entry: _Entry, names: list[str]) -> list[tuple[str, Process]]:
+    """Channel and process of each named disturbance."""
     known = {**entry.disturbances, **_FAULTS}
-    for name in disturbance.split("+"):
+    for name in names:
         if name not in known:
             raise UserError(
                 f"unknown disturbance {name!r} of {env_id}{nearest(name, known)} "
                 f"(known: {', '.join(known)})"
             )
-    return [known[name] for name in disturbance.split("+")]
+    return [known[name] for name in names]
 
 
 def _disturbed(env_id: str, entry: _Entry, disturbance: str, parameters: dict[str, Any]) -> Any:
     """The entry's environment, disturbed, with ``parameters`` shared out among them."""
     base: Any = entry.env
-    names = disturbance.split("+")
-    channels, processes = zip(*_lookup(env_id, entry, disturbance), strict=True)
+    alternatives = [alternative.split("+") for alternative in disturbance.split("/")]
+    names = [name for alternative in alternatives for name in alternative]
+    channels, processes = zip(*_lookup(env_id, entry, names), strict=True)
     rest, reward_from = dict(parameters), "state"
     also: tuple[str, ...] = ()
     if hasattr(base, "observed_reward"):
-        if set(names) & set(entry.reward_from_observation):
+        if all(set(part) & set(entry.reward_from_observation) for part in alternatives):
             reward_from = "observation"
         reward_from = rest.pop("reward_from", reward_from)
         also = ("reward_from",)
     what = f"{env_id} with {disturbance}"
     _check_owners(what, names, processes, rest)
-    assigned = _assign(what, (*processes, base.default_params), rest, also)
-    processes, params = assigned[:-1], assigned[-1]
+    mixture = (Mixture(),) if len(alternatives) > 1 else ()
+    if mixture:
+        _check_one_channel(what, channels, processes)
+    *assigned, params = _assign(
+        what, (*processes, *mixture, base.default_params), rest, also
+    )
+    processes = tuple(assigned[: len(names)])
     for process in processes:
         process.validate()
     for name in entry.positive:
@@ -335,8 +343,16 @@ def _disturbed(env_id: str, entry: _Entry, disturbance: str, parameters: dict[st
     if hasattr(params, "max_steps_in_episode"):
         require(params, "max_steps_in_episode", low=1)
 
+    of_each = iter(zip(processes, channels, strict=True))
+    alternatives_of = [[next(of_each) for _ in alternative] for alternative in alternatives]
+
     def on(channel: str) -> Process:
-        return sequence(*(p for p, c in zip(processes, channels, strict=True) if c == channel))
+        members = [sequence(*(p for p, c in part if c == channel)) for part in alternatives_of]
+        if not mixture or all(isinstance(member, NoDisturbance) for member in members):
+            return sequence(*members)
+        mixed = assigned[-1].replace(processes=tuple(members))
+        mixed.validate()
+        return mixed
 
     for channel in {channel for channel, _ in entry.disturbances.values()} - {*CHANNELS}:
         params = params.replace(**{channel: on(channel)})
@@ -361,6 +377,22 @@ def _check_owners(
                 f"{what}: {name!r} could be that of {' or '.join(owners)}; "
                 "join such disturbances with rtd.disturb"
             )
+
+
+def _check_one_channel(
+    what: str, channels: tuple[str, ...], processes: tuple[Process, ...]
+) -> None:
+    """Raise UserError for alternatives that do not all disturb the same thing.
+
+    Each channel would draw its own kind, and an episode would mix parts of several alternatives.
+    """
+    pairs = zip(channels, processes, strict=True)
+    disturbed = {channel for channel, process in pairs if not isinstance(process, NoDisturbance)}
+    if len(disturbed) > 1:
+        raise UserError(
+            f"{what}: alternatives must all disturb the same thing, not the "
+            f"{' and the '.join(sorted(disturbed))}; train on each of them by itself"
+        )
 
 
 def _assign(

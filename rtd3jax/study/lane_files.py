@@ -148,5 +148,6 @@ class LaneFiles:
 
 def cell_name(cell: Cell) -> str:
     """A directory name that tells cells apart."""
-    text = f"{cell.env}_{cell.disturbance}_{cell.config.algorithm}_l{cell.config.history_length}"
-    return re.sub(r"[^A-Za-z0-9._=+-]", "-", text)
+    disturbance = cell.disturbance.replace("/", "~")  # alternatives, told from other characters
+    text = f"{cell.env}_{disturbance}_{cell.config.algorithm}_l{cell.config.history_length}"
+    return re.sub(r"[^A-Za-z0-9._=+~-]", "-", text)

@@ -37,7 +37,8 @@ def parser(description: str | None) -> argparse.ArgumentParser:
         description=description,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog=f"disturbances:\n{worlds}\n  parameters may follow: noise:sigma=1.0\n"
-        "  + joins several: ar1-slip+dropout:p=0.2\n\n"
+        "  + joins several: ar1-slip+dropout:p=0.2\n"
+        "  / separates alternatives, of which each episode draws one: noise/random-sine\n\n"
         "example:\n  python -m rtd3jax.sweep --env pendulum --algorithms td3 lstm-td3-1ha1hc \\\n"
         "      --disturbances random-sine noise --history-lengths 1 10 --seeds 5 --out runs/mine",
     )
