@@ -35,7 +35,7 @@ run = rtd.train(rtd.make("pendulum"), config, [0, 1], progress=False)
 def test_a_recurrent_agent_compensates_wheel_slip():
     code = """
 from rtd3jax.study.presets import PRESETS
-settings = dict(PRESETS["quick"][0].settings, total_steps=8_000, eval_every=8_000, batch_size=50)
+settings = dict(PRESETS["quick"][0].settings, total_steps=8_000, eval_every=8_000)
 settings |= dict(algorithm="lstm-td3-1ha1hc", history_length=1, eval_episodes=20)
 config = rtd.Config(**settings)
 run = rtd.train(rtd.make("rover", "ar1-slip"), config, [0, 1], progress=False)
