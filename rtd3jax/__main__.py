@@ -9,15 +9,15 @@ import sys
 import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 
+from rtd3jax.cli.common import show_what_can_be_shown
 from rtd3jax.envs.builtin import DISTURBANCES
 from rtd3jax.envs.registry import FAULTS
 from rtd3jax.registries import AGENTS, MEMORIES
-from rtd3jax.study.command import show_what_can_be_shown
 from rtd3jax.study.presets import PRESETS
 from rtd3jax.system.versions import versions_of
 
 _WIDTH = 79
-_FOLDER = str(pathlib.Path(__file__).parent)
+_FOLDER = str(pathlib.Path(__file__).parent / "cli")
 _PACKAGES = ("rtd3jax", "jax", "flax", "gymnax")
 _MARK = "``python -m rtd3jax."
 """How the docstring of a command begins: the name and "``: " follow, then what it does."""
@@ -55,7 +55,7 @@ def _lines() -> Iterator[str]:
 def commands() -> dict[str, str]:
     """Every command's purpose, by name: the first sentence of its module, which is not imported."""
     found = {}
-    for module in pkgutil.iter_modules([_FOLDER], "rtd3jax."):
+    for module in pkgutil.iter_modules([_FOLDER], "rtd3jax.cli."):
         spec = module.module_finder.find_spec(module.name, None)
         get_source = getattr(spec.loader, "get_source", None) if spec is not None else None
         source = get_source(module.name) if get_source is not None else None

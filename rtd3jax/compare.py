@@ -1,73 +1,10 @@
-"""``python -m rtd3jax.compare RUN_A RUN_B ...``: what runs reached in the cells they share.
+"""Entry point of ``python -m rtd3jax.compare``; `rtd3jax.cli.compare` holds the command."""
 
-The first run is what the others are compared with: differences are paired where seeds are equal.
-Prints a Markdown table; with --out DIR also writes DIR/compare.parquet and DIR/compare.md.
-"""
-
-import argparse
 import sys
-from collections.abc import Sequence
 
-from rtd3jax.errors import UserError
-from rtd3jax.study.command import exit_status, show_what_can_be_shown
-from rtd3jax.study.comparison import MEASURES, compare_runs, comparison_markdown, differing_settings
-from rtd3jax.study.rundir import RunDirectory
-from rtd3jax.system.files import user_path, write_bytes_atomically
+from rtd3jax.cli.compare import main
 
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; the exit status: 0 done, 2 bad input."""
-    options = _parser().parse_args(arguments)
-    return exit_status(lambda: _run(options), lambda: options.out or options.runs[0])
-
-
-def _run(options: argparse.Namespace) -> int:
-    directories = [RunDirectory.open(run) for run in options.runs]
-    names = _short_names([str(directory.path.resolve()) for directory in directories])
-    measure = MEASURES[options.true_return]
-    table = compare_runs(directories, names, measure)
-    settings = differing_settings(directories, names, table)
-    text = comparison_markdown(table, names, settings, measure)
-    print(text, end="")
-    if options.out is not None:
-        out = user_path(options.out)
-        if out.exists() and not out.is_dir():
-            raise UserError(f"{out} is a file: --out names a directory")
-        write_bytes_atomically(out / "compare.parquet", table.to_parquet(index=False))
-        write_bytes_atomically(out / "compare.md", text.encode())
-        print(f"\nresults: {out / 'compare.parquet'}, {out / 'compare.md'}")
-    return 0
-
-
-def _short_names(paths: list[str]) -> list[str]:
-    """The last parts of the paths: as few as tell them apart."""
-    parts = [path.replace("\\", "/").split("/") for path in paths]
-    for count in range(1, max(map(len, parts)) + 1):
-        names = ["/".join(part[-count:]) for part in parts]
-        if len(set(names)) == len(names):
-            return names
-    return paths
-
-
-def _parser() -> argparse.ArgumentParser:
-    show_what_can_be_shown()
-    parser = argparse.ArgumentParser(
-        prog="python -m rtd3jax.compare",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog="example:\n  python -m rtd3jax.compare runs/before runs/after --out runs/compared",
-    )
-    parser.add_argument(
-        "runs", nargs="+", metavar="RUN", help="run directories, the baseline first"
-    )
-    parser.add_argument("--out", metavar="DIR", help="write the table there too")
-    parser.add_argument(
-        "--true-return",
-        action="store_true",
-        help="compare returns of the undisturbed state, not those of the reward as given",
-    )
-    return parser
-
+__all__ = ["main"]
 
 if __name__ == "__main__":
     sys.exit(main())

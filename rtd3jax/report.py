@@ -1,41 +1,10 @@
-"""``python -m rtd3jax.report RUN``: the page of a run directory, one HTML file without a network.
+"""Entry point of ``python -m rtd3jax.report``; `rtd3jax.cli.report` holds the command."""
 
-A sweep writes it too; this command writes it again, from another version or for an older run.
-"""
-
-import argparse
 import sys
-from collections.abc import Sequence
 
-from rtd3jax.study.command import exit_status, import_worlds, run_parser
-from rtd3jax.study.report.page import NAME, write_page
-from rtd3jax.study.rundir import RunDirectory
-from rtd3jax.system.files import user_path
+from rtd3jax.cli.report import main
 
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; the exit status: 0 done, 2 bad input."""
-    options = _parser().parse_args(arguments)
-    return exit_status(lambda: _run(options), lambda: options.run)
-
-
-def _run(options: argparse.Namespace) -> int:
-    import_worlds(options.imports)
-    directory = RunDirectory.open(options.run)
-    out = None if options.out is None else user_path(options.out)
-    path = write_page(directory, out, playback=options.playback)
-    print(f"{path}: {path.stat().st_size / 2**20:.1f} MiB")
-    return 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = run_parser("report", __doc__, "runs/quick")
-    parser.add_argument("--out", metavar="FILE", help=f"the page [RUN/{NAME}]")
-    parser.add_argument(
-        "--no-playback", dest="playback", action="store_false", help="no episodes in the page"
-    )
-    return parser
-
+__all__ = ["main"]
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -24,7 +24,6 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from rtd3jax.errors import UserError, first_line
-from rtd3jax.study.command import import_worlds
 from rtd3jax.study.derive import Reference
 from rtd3jax.study.early import EarlyAnswers
 from rtd3jax.study.execute import Work, train_here, waiting_jobs
@@ -34,6 +33,7 @@ from rtd3jax.study.loggers import Logger
 from rtd3jax.study.memory_plan import job_bytes, lanes_at_once, usable_memory
 from rtd3jax.study.plan import Cell, label
 from rtd3jax.study.rundir import PACKAGES, RunDirectory
+from rtd3jax.system.imports import import_modules
 from rtd3jax.system.versions import versions_of
 from rtd3jax.training.checkpoint import checkpoint_steps
 from rtd3jax.training.lanes import Job, workers
@@ -226,7 +226,7 @@ def _probe(mark: str, imports: list[str]) -> tuple[dict[str, str], str | None, s
     """On a node: its versions, what it reads at ``mark``, and what else is wrong."""
     problem = None
     try:
-        import_worlds(imports)
+        import_modules(imports)
     except UserError as error:
         problem = str(error)
     path = Path(mark)
@@ -238,7 +238,7 @@ def _train_cell(
 ) -> tuple[list[str], dict[str, Any]]:
     """On a node: train the lanes of a cell that are not done; complaints, and a line of `TASKS`."""
     began = time.time()
-    import_worlds(imports)
+    import_modules(imports)
     directory = RunDirectory.open(path)
     cell = directory.cells[index]
     # All cells, because side by side they share a program as wide as the longest window.

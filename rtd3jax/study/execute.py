@@ -25,7 +25,7 @@ class Work:
     Attributes:
         strategy: ``map`` or ``vmap``; see `rtd3jax.training.lanes`.
         at_once: lanes that fit in memory.
-        interval: of checkpoints, (seconds, steps); see `rtd3jax.study.options.parse_interval`.
+        interval: between checkpoints, (seconds, steps): None for both chooses it from their cost.
         quiet: no progress bar, no remarks.
         page: whether the run's page is written.
         workers: as many as this at most; all that there are by default.

@@ -4,7 +4,7 @@ import struct
 
 import pytest
 
-from rtd3jax import sweep
+from rtd3jax.cli import sweep
 from rtd3jax.errors import UserError
 from rtd3jax.study import loggers
 from rtd3jax.study.loggers import METRIC, check_loggers, open_loggers

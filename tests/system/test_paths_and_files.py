@@ -12,8 +12,8 @@ import pytest
 
 import rtd3jax
 import rtd3jax as rtd
-from rtd3jax.study import options
-from rtd3jax.study.command import show_what_can_be_shown
+from rtd3jax.cli import sweep_options
+from rtd3jax.cli.common import show_what_can_be_shown
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.system.files import (
     read_arrays,
@@ -68,8 +68,8 @@ def test_a_home_directory_is_found_in_every_path(tmp_path, monkeypatch):
     write_new("~/a/f", b"1")
     write_arrays("~/a/g", {}, {})
     assert read_arrays("~/a/g") == ({}, {}) and (tmp_path / "a" / "f").read_bytes() == b"1"
-    given = options.parser("").parse_args(["--env", "rover", "--out=~/x"])
-    assert options.out(given) == tmp_path / "x"
+    given = sweep_options.parser("").parse_args(["--env", "rover", "--out=~/x"])
+    assert sweep_options.out(given) == tmp_path / "x"
     RunDirectory("~/r", [], [0], 1)
     assert RunDirectory.open(pathlib.Path("~/r")).path == tmp_path / "r"
     assert not (tmp_path / "~").exists()
@@ -109,7 +109,7 @@ def test_files_are_utf8_whatever_the_locale():
 def test_the_terminal_gets_what_it_can_show(encoding, monkeypatch):
     shown = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(shown, encoding=encoding))
-    options.parser("")  # as every command does first
+    sweep_options.parser("")  # as every command does first
     print("3 × 2, ≥ λ")
     sys.stdout.flush()
     assert shown.getvalue() == "3 × 2, ≥ λ\n".encode(encoding, "replace")

@@ -1,11 +1,9 @@
 """What the commands have in common: how bad input ends them, and how modules of a user are."""
 
 import argparse
-import importlib
 import io
-import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 from rtd3jax.errors import UserError
@@ -34,7 +32,7 @@ def exit_status(work: Callable[[], int], place: Callable[[], Any]) -> int:
 
 
 def add_import(group: argparse._ActionsContainer) -> None:
-    """Give a parser, or a group of one, the option whose values go to `import_worlds`."""
+    """Give a parser, or a group of one, the option whose values go to `import_modules`."""
     group.add_argument(
         "--import",
         dest="imports",
@@ -59,15 +57,3 @@ def run_parser(
     parser.add_argument("run", help=what)
     add_import(parser)
     return parser
-
-
-def import_worlds(modules: Sequence[str]) -> None:
-    """Import what registers environments or agents (``--import``); the working directory counts."""
-    for module in modules:
-        sys.path.insert(0, os.getcwd())
-        try:
-            importlib.import_module(module)
-        except ImportError as error:
-            raise UserError(f"--import {module}: {error}") from error
-        finally:
-            sys.path.pop(0)

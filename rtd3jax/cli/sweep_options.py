@@ -10,11 +10,11 @@ from typing import Any, NoReturn
 import jax
 
 from rtd3jax.agents.variants import ALGORITHMS
+from rtd3jax.cli.common import add_import, show_what_can_be_shown
 from rtd3jax.config import Config
 from rtd3jax.envs.builtin import DISTURBANCES, ENVIRONMENTS
 from rtd3jax.errors import UserError
 from rtd3jax.registries import AGENTS
-from rtd3jax.study.command import add_import, show_what_can_be_shown
 from rtd3jax.study.loggers import LOGGERS
 from rtd3jax.study.plan import Grid
 from rtd3jax.study.presets import PRESETS

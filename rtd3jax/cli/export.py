@@ -1,0 +1,71 @@
+"""``python -m rtd3jax.export``: write a trained policy in a form that leaves the lab."""
+
+import argparse
+from collections.abc import Sequence
+
+from rtd3jax.cli.common import exit_status, run_parser
+from rtd3jax.policies.export.formats import FORMATS
+from rtd3jax.policies.load import load_policy
+from rtd3jax.policies.trained import Policy
+from rtd3jax.registries import AGENTS
+from rtd3jax.system.files import user_path
+from rtd3jax.system.imports import import_modules
+
+POLICY = "policy"
+"""The form that `rtd3jax.load_policy` reads."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; the exit status: 0 done, 2 bad input."""
+    options = _parser().parse_args(arguments)
+    return exit_status(lambda: _run(options), lambda: options.run)
+
+
+def _run(options: argparse.Namespace) -> int:
+    import_modules(options.imports)
+    policy = load_policy(
+        options.run,
+        algorithm=options.agent,
+        seed=options.seed,
+        env=options.env,
+        disturbance=options.disturbance,
+        history_length=options.history_length,
+    )
+    path = user_path(options.out or _default_name(policy, options))
+    if options.format == POLICY:
+        policy.save(path, overwrite=options.force)
+    else:
+        policy.export(path, options.format, overwrite=options.force)
+    print(
+        f"{path}: {policy.algorithm} l={int(policy.history_length)}, "
+        f"{policy.observation_size} observation elements, actions of shape {policy.action_shape}, "
+        f"{path.stat().st_size:,} bytes"
+    )
+    return 0
+
+
+def _default_name(policy: Policy, options: argparse.Namespace) -> str:
+    suffix = ".safetensors" if options.format == POLICY else FORMATS[options.format][0]
+    if user_path(options.run).is_dir():
+        stem = f"{policy.algorithm}_l{int(policy.history_length)}_seed-{options.seed or 0}"
+        # A module's name must be an identifier to be imported by name.
+        return (stem.replace("-", "_") if suffix == ".py" else stem) + suffix
+    return str(user_path(options.run).with_suffix(suffix))
+
+
+def _parser() -> argparse.ArgumentParser:
+    example = "runs/quick --agent h-td3 --seed 0 --format onnx"
+    what = "a run directory, or a file that policy.save wrote"
+    parser = run_parser("export", __doc__, example, what)
+    parser.add_argument(
+        "--format", required=True, choices=(*FORMATS, POLICY), help="the form of the file"
+    )
+    which = parser.add_argument_group("which lane of the run directory")
+    which.add_argument("--agent", help=f"the agent: {', '.join(AGENTS)}, or your own")
+    which.add_argument("--seed", type=int, help="the seed [0]")
+    which.add_argument("--env", help="where its lanes differ: the environment")
+    which.add_argument("--disturbance", help="the disturbance, as it was given to the sweep")
+    which.add_argument("--history-length", type=int, metavar="L", help="past steps in a window")
+    parser.add_argument("--out", metavar="FILE", help="the file [AGENT_lL_seed-N.SUFFIX, here]")
+    parser.add_argument("--force", action="store_true", help="replace the file if it exists")
+    return parser

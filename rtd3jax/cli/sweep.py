@@ -1,0 +1,189 @@
+"""``python -m rtd3jax.sweep``: train every cell of a study, and write down what came out.
+
+A cell is an algorithm under a disturbance with a history length; its seeds are trained side by
+side. The same command again trains what is missing; with more seeds, cells or steps, those too.
+"""
+
+import argparse
+import collections
+import functools
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from rtd3jax.cli import sweep_options
+from rtd3jax.cli.common import exit_status
+from rtd3jax.errors import UserError
+from rtd3jax.study.cluster import train_on_cluster
+from rtd3jax.study.execute import Work, train_here
+from rtd3jax.study.finish import finish
+from rtd3jax.study.hosts import own_shard, own_share, relaunch
+from rtd3jax.study.lock import parse_shard, writer
+from rtd3jax.study.loggers import check_loggers, open_loggers
+from rtd3jax.study.memory_plan import lanes_at_once, usable_memory
+from rtd3jax.study.plan import make_cells, plan_text
+from rtd3jax.study.references import references_of
+from rtd3jax.study.rundir import RunDirectory
+from rtd3jax.study.starts import add_starts
+from rtd3jax.study.status import ledger
+from rtd3jax.system.imports import import_modules
+from rtd3jax.training.lanes import Job, workers
+from rtd3jax.training.run import check_strategy
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; the exit status.
+
+    0 done, 1 lanes were lost or failed, 2 bad input, 130 interrupted, 143 asked to terminate (as a
+    batch system does before it kills).
+    """
+    try:
+        options = sweep_options.parser(__doc__).parse_args(arguments)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    before = _on_termination(_terminate)
+    try:
+        return exit_status(lambda: _start(options, arguments), lambda: sweep_options.out(options))
+    finally:
+        _on_termination(before)
+
+
+def _start(options: argparse.Namespace, arguments: Sequence[str] | None) -> int:
+    import_modules(options.imports)
+    if options.distributed and not jax.distributed.is_initialized():
+        relaunch("rtd3jax.sweep", arguments)
+    if options.device:
+        jax.config.update("jax_default_device", sweep_options.device(options.device))
+    return _run(options)
+
+
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM: lanes write their checkpoints, as after Ctrl-C."""
+
+
+def _terminate(*_: object) -> None:
+    raise _Terminated
+
+
+def _on_termination(handler: Any) -> Any:
+    """Set SIGTERM's handler; the one before. Only the main thread may."""
+    if threading.current_thread() is not threading.main_thread():
+        return None
+    return signal.signal(signal.SIGTERM, handler)
+
+
+def _run(options: argparse.Namespace) -> int:
+    if options.status:
+        return _status(sweep_options.out(options))
+    cells = make_cells(sweep_options.grids(options), sweep_options.overrides(options))
+    seeds = list(range(sweep_options.count("seeds", options.seeds)))
+    episodes = sweep_options.count("final_episodes", options.final_episodes)
+    strategy = check_strategy(options.strategy)
+    check_loggers(options.log)
+    if sum(map(bool, (options.shard, options.distributed, options.cluster))) > 1:
+        raise UserError("--shard, --distributed and --cluster each share out the lanes: choose one")
+    out = sweep_options.out(options)
+    directory = RunDirectory(out, cells, seeds, episodes, prepare=False)
+    news = "" if options.fresh else directory.plan()
+    jobs = directory.jobs(strategy)
+    if options.dry_run:
+        say = functools.partial(print, file=sys.stderr, flush=True)
+        print(plan_text(directory.cells, directory.seeds, jobs, strategy, usable_memory(), say))
+        print(news, end="\n" if news else "")
+        return 0
+    # On a cluster its nodes, not this machine, must have the memory.
+    fit = len(jobs) if options.cluster else None
+    at_once = fit or lanes_at_once(jobs, strategy, len(workers()), usable_memory())
+    interval = sweep_options.parse_interval(options.checkpoint_every)
+    shard = _shard(options)
+    add_starts(directory, jobs, write=False)  # before anything is written
+    if options.fresh:
+        _set_aside(out)
+    if news := directory.prepare():
+        print(news)
+    work = Work(
+        strategy,
+        at_once,
+        interval,
+        quiet=options.quiet,
+        page=options.report,
+        keep=options.keep_checkpoints,
+    )
+    with writer(directory.path, shard):
+        if directory.refresh():  # another process was quicker
+            jobs = directory.jobs(strategy)
+        return _train(directory, _share(jobs, shard, options), work, options)
+
+
+def _shard(options: argparse.Namespace) -> tuple[int, int] | None:
+    if options.distributed:
+        return own_shard()
+    return None if options.shard is None else parse_shard(options.shard)
+
+
+def _share(
+    jobs: list[Job], shard: tuple[int, int] | None, options: argparse.Namespace
+) -> list[Job]:
+    """A shard's lanes: every n-th, so that the shares cost about the same."""
+    if options.distributed:
+        return own_share(jobs)
+    return jobs if shard is None else jobs[shard[0] - 1 :: shard[1]]
+
+
+def _train(
+    directory: RunDirectory, jobs: list[Job], work: Work, options: argparse.Namespace
+) -> int:
+    references = references_of(directory.cells)
+    complaints: list[str] = []
+    interrupted = 0
+    with open_loggers(options.log, directory) as logger:
+        try:
+            if options.cluster:
+                where = options.cluster, options.imports
+                train_on_cluster(directory, jobs, work, complaints, references, logger, *where)
+            else:
+                train_here(directory, jobs, work, complaints, references, logger)
+        except KeyboardInterrupt as interrupt:
+            interrupted = 143 if isinstance(interrupt, _Terminated) else 130
+    finish(directory, references, page=options.report, interrupted=bool(interrupted))
+    print((directory.path / "summary.md").read_text("utf-8"))
+    print(f"results: {directory.path}")
+    if interrupted:
+        print("interrupted: the same command goes on with the lanes that are missing")
+        return interrupted
+    for line in complaints:
+        print(line, file=sys.stderr)
+    return 1 if complaints else 0
+
+
+def _set_aside(out: Path) -> None:
+    """Move a run directory away: what was trained is kept under another name."""
+    if not (out / "config.json").exists():
+        return
+    with writer(out, None):
+        for number in range(1, 10_000):
+            aside = out.with_name(f"{out.name}.old-{number}")
+            if not aside.exists():
+                out.rename(aside)
+                print(f"what was there is now {aside}")
+                return
+
+
+def _status(out: Path) -> int:
+    directory = RunDirectory.open(out)
+    lanes = ledger(directory)
+    for row in lanes:
+        length = f"l={row['history_length']}"
+        print(
+            f"{row['env']:10} {row['disturbance']:24} {row['algorithm']:20} {length:5} "
+            f"seed {row['seed']:<4} {row['status']:9} {row['step']:>10,}  {row['reason']}"
+        )
+    counts = collections.Counter(row["status"] for row in lanes)
+    print(", ".join(f"{count} {status}" for status, count in counts.items()))
+    return 1 if counts["failed"] or counts["lost"] else 0
