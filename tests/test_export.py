@@ -82,7 +82,9 @@ def test_a_lane_file_alone_is_refused_with_the_way(run):
         rtd.load_policy(lane)
 
 
-def test_a_lane_of_a_world_that_is_not_registered_is_loaded_and_exported(tmp_path, monkeypatch):
+def test_a_lane_of_an_environment_that_is_not_registered_is_loaded_and_exported(
+    tmp_path, monkeypatch
+):
     known = dict(registry._entries)
     monkeypatch.setattr(registry, "_entries", dict(registry._entries))
     rtd.register("robot", rtd.make("pendulum"), replace=True)

@@ -31,7 +31,7 @@ def _play(policy, observations):
     return jax.lax.scan(step, policy.init(), jnp.asarray(observations))[1]
 
 
-def test_there_is_a_policy_of_each_agent_in_each_world():
+def test_there_is_a_policy_of_each_agent_in_each_environment():
     assert len(NAMES) == 3 * len(rtd.ALGORITHMS)
     assert all(read_arrays(GOLDEN / f"{name}.safetensors")[1]["format"] == 1 for name in NAMES)
 

@@ -33,14 +33,14 @@ def test_python_blocks_run(path, run):
     names = run(path)
     if path.stem == "README":
         assert names["returns"].shape == (100,) and names["baseline"].shape == (100,)
-    if path.stem == "bring_a_world":
+    if path.stem == "bring_an_environment":
         assert set(names["episodes"]["algorithm"]) == {"td3", "random", "half-power"}
         assert names["returns"].shape == (2,)
 
 
 def test_the_guides_promises_about_length():
     """A plant in 30 to 40 lines, a disturbance in about 15."""
-    plant, process = BLOCK.findall((ROOT / "docs" / "bring_a_world.md").read_text())[:2]
+    plant, process = BLOCK.findall((ROOT / "docs" / "bring_an_environment.md").read_text())[:2]
     assert 30 <= len(plant.splitlines()) <= 45 and len(process.splitlines()) <= 16
 
 

@@ -285,17 +285,17 @@ def test_a_full_disk_is_one_line_and_loses_nothing(tmp_path, monkeypatch, capsys
     assert sweep.main([*TINY, "--out", str(out)]) == 0
 
 
-def test_a_module_that_registers_worlds_can_be_imported(tmp_path, monkeypatch, capsys):
+def test_a_module_that_registers_environments_can_be_imported(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(registry, "_entries", dict(registry._entries))
-    (tmp_path / "own_worlds.py").write_text(
+    (tmp_path / "own_environments.py").write_text(
         "import rtd3jax as rtd\nrtd.register('own', rtd.make('rover'))\n"
     )
     arguments = ["--env", "own", "--disturbances", "delay:steps=3", "--algorithms", "td3"]
-    assert sweep.main([*arguments, "--dry-run", "--import", "own_worlds"]) == 0
+    assert sweep.main([*arguments, "--dry-run", "--import", "own_environments"]) == 0
     assert "own        delay:steps=3" in capsys.readouterr().out
-    assert sweep.main([*arguments, "--import", "no_such_worlds"]) == 2
-    assert "--import no_such_worlds: No module named" in capsys.readouterr().err
+    assert sweep.main([*arguments, "--import", "no_such_environments"]) == 2
+    assert "--import no_such_environments: No module named" in capsys.readouterr().err
 
 
 def test_a_rover_with_faults_has_its_baselines_too():

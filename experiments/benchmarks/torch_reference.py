@@ -2,7 +2,7 @@
 
 What makes it fast: `torch.nn.LSTM` over whole windows, no tape where nothing is differentiated
 (targets, and the critic's past tokens in the actor's loss), fused Adam, one fused call for all
-Polyak averages, one gather per window. Shapes are those of `numpy_world`.
+Polyak averages, one gather per window. Shapes are those of `numpy_environment`.
 """
 
 import copy
@@ -12,7 +12,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from experiments.benchmarks.numpy_world import Batch, Window
+from experiments.benchmarks.numpy_environment import Batch, Window
 from rtd3jax.agents.networks import NetworkSpec
 from rtd3jax.agents.variants import Variant
 

@@ -16,7 +16,7 @@ import time
 import numpy as np
 import torch
 
-from experiments.benchmarks.numpy_world import (
+from experiments.benchmarks.numpy_environment import (
     ACTION_HIGH,
     ACTION_LOW,
     ACTION_SIZE,
@@ -63,11 +63,11 @@ class Seed:
         self._ring = Ring(
             capacity, OBSERVATION_SIZE, ACTION_SIZE, width if self._keeps_carry else None
         )
-        self._world = Rover(self._random)
+        self._environment = Rover(self._random)
         self._begin()
 
     def _begin(self) -> None:
-        self._observation = self._world.reset()
+        self._observation = self._environment.reset()
         self._previous = np.zeros(ACTION_SIZE, np.float32)
         self._episode_step = 0
 
@@ -83,7 +83,7 @@ class Seed:
         action = self._act(window, carry, number)
         if number >= self._starts:
             self._learn(number - self._starts + 1)
-        observation, reward, done = self._world.step(action)
+        observation, reward, done = self._environment.step(action)
         self._ring.put(
             self._previous,
             self._observation,

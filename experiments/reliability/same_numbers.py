@@ -32,8 +32,8 @@ for agent in agents:
         algorithm=agent, history_length=None if agent == "td3" else 2, total_steps=int(steps),
         hidden_size=64, eval_every=500, replay_capacity=1_200,
     )
-    world = rtd.make(env, "ar1-slip" if env == "rover" else "random-sine")
-    run = rtd.train(world, config, seeds=[0], progress=False)
+    environment = rtd.make(env, "ar1-slip" if env == "rover" else "random-sine")
+    run = rtd.train(environment, config, seeds=[0], progress=False)
     arrays[f"{agent}.returns"], arrays[f"{agent}.true_returns"] = run.returns, run.true_returns
     for path, leaf in jax.tree_util.tree_leaves_with_path(run.policy(0).actor):
         name = ".".join(str(part.key) for part in path).replace("lstm.", "memory.")

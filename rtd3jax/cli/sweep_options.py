@@ -31,12 +31,12 @@ class _Parser(argparse.ArgumentParser):
 def parser(description: str | None) -> argparse.ArgumentParser:
     """The command line of ``rtd3jax.sweep``; bad input raises `UserError`."""
     show_what_can_be_shown()
-    worlds = "\n".join(f"  {env}: {', '.join(DISTURBANCES[env])}" for env in ENVIRONMENTS)
+    environments = "\n".join(f"  {env}: {', '.join(DISTURBANCES[env])}" for env in ENVIRONMENTS)
     found = _Parser(
         prog="python -m rtd3jax.sweep",
         description=description,
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog=f"disturbances:\n{worlds}\n  parameters may follow: noise:sigma=1.0\n"
+        epilog=f"disturbances:\n{environments}\n  parameters may follow: noise:sigma=1.0\n"
         "  + joins several: ar1-slip+dropout:p=0.2\n"
         "  / separates alternatives, of which each episode draws one: noise/random-sine\n\n"
         "example:\n  python -m rtd3jax.sweep --env pendulum --algorithms td3 lstm-td3-1ha1hc \\\n"
@@ -131,11 +131,11 @@ def grids(options: argparse.Namespace) -> list[Grid]:
         found = [Grid(options.env, ("none",), ALGORITHMS)]
     else:
         found = list(PRESETS[options.preset])
-        worlds = list(dict.fromkeys(grid.env for grid in found))
-        if options.env is not None and worlds != [options.env]:
+        environments = list(dict.fromkeys(grid.env for grid in found))
+        if options.env is not None and environments != [options.env]:
             raise UserError(
-                f"--preset {options.preset} has settings for {' and '.join(worlds)}; leave out "
-                f"--env {options.env}, or the preset"
+                f"--preset {options.preset} has settings for {' and '.join(environments)}; "
+                f"leave out --env {options.env}, or the preset"
             )
     given = {
         "disturbances": options.disturbances and tuple(options.disturbances),

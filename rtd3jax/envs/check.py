@@ -250,7 +250,7 @@ def _episodes(
 
 @functools.partial(jax.jit, static_argnames="steps")
 def _draw(seed: jax.Array, low: jax.Array, high: jax.Array, steps: int) -> tuple[jax.Array, ...]:
-    """Keys of resets [E] and steps [E, T], and actions [E, T, A]; compiled once for all worlds."""
+    """Keys of resets [E] and steps [E, T], and actions [E, T, A]; compiled only once."""
     key_resets, key_steps, key_actions = jax.random.split(jax.random.key(seed), 3)
     shape = (EPISODES, steps)
     actions = jax.random.uniform(key_actions, (*shape, *low.shape), jnp.float32, low, high)

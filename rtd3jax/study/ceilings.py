@@ -28,15 +28,15 @@ def ceilings_of(
     version = versions_of(["rtd3jax"])["rtd3jax"]
     kept = _read(path, version)
     found, before = {}, len(kept)
-    for world, cell in {(cell.env, cell.disturbance): cell for cell in cells}.items():
-        name = " | ".join(world)
+    for environment, cell in {(cell.env, cell.disturbance): cell for cell in cells}.items():
+        name = " | ".join(environment)
         if name not in kept and compute:
             try:
                 kept[name] = _entry(ceiling(cell.make_env(), env_id=cell.env))
             except UserError as error:
-                found[world] = {"missing": str(error)}
+                found[environment] = {"missing": str(error)}
         if name in kept:
-            found[world] = kept[name]
+            found[environment] = kept[name]
     if len(kept) > before:
         text = json.dumps({"rtd3jax": version, "ceilings": kept}, indent=1)
         write_bytes_atomically(path, text.encode())

@@ -75,7 +75,7 @@ def train_on_cluster(
         references: for the tables that are made meanwhile.
         logger: of trackers, fed by this process.
         address: ``auto``, or of the cluster.
-        imports: modules that register worlds.
+        imports: modules that register environments.
 
     Raises:
         UserError: when there is no cluster, its nodes cannot do the work, or Ray is not installed.

@@ -54,7 +54,8 @@ def compare_runs(
             rows.append({**row, "run": name, **vars(summary), **vars(compared)})
     if not rows:
         has = "; ".join(
-            f"{name} has {_worlds(of_run)}" for name, of_run in zip(names, values, strict=True)
+            f"{name} has {_environments(of_run)}"
+            for name, of_run in zip(names, values, strict=True)
         )
         raise UserError(
             f"no finished cell of {names[0]} (environment, disturbance, agent and history length) "
@@ -141,13 +142,18 @@ def _values(directory: RunDirectory, measure: str) -> dict[tuple, dict[int, floa
     return found
 
 
-def _worlds(of_run: Mapping[tuple, Any]) -> str:
+def _environments(of_run: Mapping[tuple, Any]) -> str:
     """What a run consists of, in few words."""
-    worlds: dict[str, dict[str, None]] = {}
+    environments: dict[str, dict[str, None]] = {}
     for env, disturbance, algorithm, length in of_run:
         agent = f"{algorithm} {length}" if length else algorithm
-        worlds.setdefault(f"{env} {disturbance}", {})[agent] = None
-    return ", ".join(f"{world} ({', '.join(agents)})" for world, agents in worlds.items()) or "none"
+        environments.setdefault(f"{env} {disturbance}", {})[agent] = None
+    return (
+        ", ".join(
+            f"{environment} ({', '.join(agents)})" for environment, agents in environments.items()
+        )
+        or "none"
+    )
 
 
 def _interval(row: Mapping[Any, Any], name: str) -> str:

@@ -141,7 +141,7 @@ def _began_from(directory: RunDirectory) -> dict[str, object]:
 
 
 def _whose(name: str, cells: Sequence[Mapping[str, Any]]) -> str:
-    """The values of a field in which cells differ, and whose they are: the world's, the agent's."""
+    """Each value of a field, followed by the environments or agents that have this value."""
     within: dict[str, set[Any]] = {}
     for cell in cells:
         within.setdefault(cell["env"], set()).add(cell[name])

@@ -99,8 +99,9 @@ def cell_jobs(
 ) -> list[Job]:
     """A job per cell and seed, owned by ``(cell, seed)``.
 
-    Side by side (``vmap``), all history lengths in a world share the longest one's program: there a
-    wider product is nearly free. One by one (``map``), each length has a program of its own.
+    Side by side (``vmap``), all history lengths in an environment share the program of the longest
+    one: there, a wider matrix product costs almost nothing more. One by one (``map``), each history
+    length has a program of its own.
 
     Args:
         cells: of the study.
@@ -118,7 +119,7 @@ def cell_jobs(
 
 
 def _windows(cells: Sequence[Cell], stages: Sequence[int]) -> list[int]:
-    """Of each cell, the longest window in its world among the cells up to its own stage."""
+    """Of each cell, the longest window in its environment among the cells up to its own stage."""
     longest: dict[str, int] = {}
     found: list[int] = []
     for end in (*stages, len(cells)):

@@ -40,22 +40,24 @@ def transfer(
         UserError: for an unknown disturbance, or when nothing is trained yet.
     """
     rows: list[dict[str, Any]] = []
-    worlds: dict[tuple[str, str], Any] = {}
+    environments: dict[tuple[str, str], Any] = {}
     problems: dict[tuple[str, str, str], int] = {}
     # A file is read once, not for each disturbance.
     policy_of = functools.lru_cache(maxsize=len(directory.seeds))(directory.lanes.policy)
     for cell in directory.cells if cells is None else cells:
         own = list(dict.fromkeys(c.disturbance for c in directory.cells if c.env == cell.env))
         for disturbance in own if tested_on is None else tested_on:
-            world = cell.env, disturbance
-            if world not in worlds:
+            environment = cell.env, disturbance
+            if environment not in environments:
                 name, parameters = parse_disturbance(disturbance)
-                worlds[world] = make(cell.env, name, **parameters)
+                environments[environment] = make(cell.env, name, **parameters)
             for seed in directory.seeds:
                 try:
                     if not directory.lanes.is_done(cell, seed):
                         continue
-                    both = both_returns(policy_of(cell, seed), worlds[world], episodes, seed)
+                    both = both_returns(
+                        policy_of(cell, seed), environments[environment], episodes, seed
+                    )
                 except UserError as error:
                     problem = cell.disturbance, disturbance, str(error)
                     problems[problem] = problems.get(problem, 0) + 1

@@ -222,15 +222,15 @@ def _checkpoints(
     env: EnvironmentLike,
     seconds: float | None,
 ) -> Checkpoints:
-    world = {"env": str(getattr(env, "name", type(env).__name__)), "params": None}
+    environment = {"env": str(getattr(env, "name", type(env).__name__)), "params": None}
     if is_simulated(env):  # what is seen of it, and with what it was made
-        world["env"] = simulated_identity(env)
+        environment["env"] = simulated_identity(env)
 
     def identity(job: Job) -> dict[str, Any]:
         index, seed = job.key
         params = [named_numbers(leaf) for leaf in jax.tree.leaves(job.lane.env_params)]
         own = {"start": job.start.where} if job.start is not None else {}
-        return {**configs[index].to_dict(), **own, **world, "params": params, "seed": seed}
+        return {**configs[index].to_dict(), **own, **environment, "params": params, "seed": seed}
 
     return Checkpoints(lambda job: directories[job.cell] / f"seed-{job.seed}", identity, seconds)
 

@@ -285,7 +285,7 @@ def test_what_xla_computes_twice_is_no_finding(disturbance):
 @pytest.mark.parametrize(
     ("env_id", "disturbance"), [(e, d) for e in ENVIRONMENTS for d in DISTURBANCES[e]]
 )
-def test_every_world_of_ours_passes(env_id, disturbance):
+def test_every_environment_of_ours_passes(env_id, disturbance):
     check_env(make(env_id, disturbance, max_steps_in_episode=12))
 
 
@@ -334,7 +334,7 @@ def test_scales_that_will_hurt_are_a_warning(recwarn):
 
 
 def test_nan_equals_nan():
-    """A world of NaN is not finite, and nothing else."""
+    """An environment of NaN is not finite, and nothing else."""
 
     class Nowhere(Good):
         def step_env(self, key, state, action, params):

@@ -173,7 +173,7 @@ def test_a_sweep_and_its_page_show_what_is_known_of_it(tank, tmp_path, monkeypat
     assert report.main([str(out)]) == 0
     page = (out / "report.html").read_text()
     data = json.loads(re.search(r'id="data">(.*?)</script>', page, re.S)[1])
-    still, leaky = data["worlds"]
+    still, leaky = data["environments"]
     named = [reference["name"] for reference in leaky["references"]]
     assert named == ["random", "closed", "proportional"]
     assert still["ceiling"]["kind"] == "exact" and "leaks" in leaky["ceiling"]["missing"]

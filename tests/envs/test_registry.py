@@ -267,10 +267,12 @@ def test_a_registered_environment_gets_parameters_and_disturbances(monkeypatch):
 def test_a_cell_that_runs_again_registers_again(monkeypatch):
     monkeypatch.setattr(registry, "_entries", dict(registry._entries))
     base = make("PointRobot-misc")
-    cell = compile("register('robot', world, **how)", "cell", "exec")
+    cell = compile("register('robot', environment, **how)", "cell", "exec")
 
-    def run(module, world, **how):
-        exec(cell, {"__name__": module, "register": register, "world": world, "how": how})
+    def run(module, environment, **how):
+        exec(
+            cell, {"__name__": module, "register": register, "environment": environment, "how": how}
+        )
 
     run("notebook", base, disturbances={"lag": Delay(3)})
     with pytest.raises(UserError, match="cannot be called"):

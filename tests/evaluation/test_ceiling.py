@@ -56,7 +56,7 @@ def test_the_sine_bound_is_named_as_one():
     assert bound.kind == "upper bound" and -0.1 < bound.mean < 0
 
 
-def test_other_worlds_are_refused_in_one_line():
+def test_other_environments_are_refused_in_one_line():
     with pytest.raises(rtd.UserError, match="no ceiling of MountainCarContinuous-v0 is known"):
         rtd.ceiling(rtd.make("MountainCarContinuous-v0"))
     with pytest.raises(rtd.UserError, match="moments of SineSlip are not known"):

@@ -19,7 +19,7 @@ from rtd3jax.registries import AGENTS
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: pip install '.[bench]'")
 
-from experiments.benchmarks.numpy_world import Ring, Rover  # noqa: E402
+from experiments.benchmarks.numpy_environment import Ring, Rover  # noqa: E402
 from experiments.benchmarks.torch_reference import Learner, tensors  # noqa: E402
 
 CAPACITY, STEPS, LENGTH, OBS, A, WIDTH = 30, 47, 2, 3, 2, 8

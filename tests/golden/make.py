@@ -30,7 +30,7 @@ AGENTS = (
 )
 
 
-def worlds():
+def environments():
     """The pendulum (actions within 2), the rover (within 1), and one whose range is not about 0."""
     pendulum, rover = rtd.make("pendulum", "random-sine"), rtd.make("rover", "ar1-slip")
     shifted = rtd.make("pendulum")
@@ -41,7 +41,7 @@ def worlds():
 def main(out: pathlib.Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     expected = {}
-    for world, env in worlds().items():
+    for environment, env in environments().items():
         for agent in AGENTS:
             config = rtd.Config(
                 algorithm=agent,
@@ -55,15 +55,15 @@ def main(out: pathlib.Path) -> None:
                 actor_learning_rate=3e-3,
             )
             policy = rtd.train(env, config, seeds=[0], progress=False).policy(0)
-            policy.save(out / f"{world}-{agent}.safetensors", overwrite=True)
+            policy.save(out / f"{environment}-{agent}.safetensors", overwrite=True)
             size = policy.observation_size
             seen = np.random.default_rng(0).normal(size=(EPISODE, size)).astype(np.float32)
             state, actions = policy.init(), []
             for observation in seen:
                 action, state = jax.jit(policy.step)(state, observation)
                 actions.append(np.asarray(action))
-            expected[f"{world}-{agent}.observations"] = seen
-            expected[f"{world}-{agent}.actions"] = np.stack(actions)
+            expected[f"{environment}-{agent}.observations"] = seen
+            expected[f"{environment}-{agent}.actions"] = np.stack(actions)
     np.savez(out / "actions.npz", **expected)
     flags = [
         *("--env", "pendulum", "--disturbances", "random-sine", "--seeds", "2"),

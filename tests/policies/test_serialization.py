@@ -161,7 +161,7 @@ def test_what_is_no_policy_is_refused(tmp_path, policy):
         rtd.load_policy(path)
 
 
-def test_a_loaded_policy_refuses_another_world(tmp_path, policy):
+def test_a_loaded_policy_refuses_another_environment(tmp_path, policy):
     policy.save(tmp_path / "p")
     loaded = rtd.load_policy(tmp_path / "p")
     with pytest.raises(rtd.UserError, match=r"shape \(2,\), not \(3,\)"):

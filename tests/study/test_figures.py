@@ -245,8 +245,8 @@ def test_figures_keep_no_global_state():
 
 
 def test_ceilings_are_lines_where_they_are_known(tmp_path, drawn):
-    worlds = ("none", "sine-slip", "other")
-    made = [cell(level=-1.0, disturbance=name) for name in worlds]
+    environments = ("none", "sine-slip", "other")
+    made = [cell(level=-1.0, disturbance=name) for name in environments]
     curves, episodes = tables(*made)
     env = curves["env"].iloc[0]
     ceilings = {

@@ -105,7 +105,7 @@ def test_operations_are_those_that_xla_counts(algorithm, segments, monkeypatch):
         assert least <= ratio <= 1.0 + left_out, (width, ratio)
 
 
-def test_side_by_side_a_world_has_the_windows_of_its_own_longest():
+def test_side_by_side_an_environment_has_the_windows_of_its_own_longest():
     settings = {"total_steps": 40, "learning_starts": 10, "batch_size": 4, "hidden_size": 4}
     grids = [
         Grid("rover", ("none",), ("lstm-td3",), (1, 2), settings),

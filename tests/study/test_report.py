@@ -56,7 +56,7 @@ def make_run(out, grid):
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """A small run of each world, with its page and (rover) its transfer matrix."""
+    """A small run of each environment, with its page and (rover) its transfer matrix."""
     found = {}
     with pytest.MonkeyPatch.context() as patch:
         best = Ceiling(-1.2, 0.1, "upper bound")
@@ -86,8 +86,8 @@ def test_the_numbers_are_those_of_the_tables(runs):
     curves = pd.read_parquet(runs["rover"] / "curves.parquet")
     for cell in data["cells"]:
         name = data["agents"][cell["agent"]]["name"]
-        world = data["worlds"][cell["world"]]["disturbance"]
-        key = {"algorithm": name, "disturbance": world, "history_length": cell["length"]}
+        environment = data["environments"][cell["environment"]]["disturbance"]
+        key = {"algorithm": name, "disturbance": environment, "history_length": cell["length"]}
         loss = cell["learning"]["critic_loss"]
         assert loss["steps"] == [40, 60] and loss["iqm"] == [2.5, 1.0]  # means over two seeds
         final = rows_of(episodes, key).groupby("seed")["return"].mean()
@@ -95,7 +95,7 @@ def test_the_numbers_are_those_of_the_tables(runs):
         points = rows_of(curves, key).groupby("step")["return"].mean()
         assert cell["curves"]["return"]["steps"] == STEPS
         assert cell["curves"]["return"]["iqm"] == pytest.approx(points.tolist(), rel=1e-4)
-    assert data["worlds"][0]["ceiling"]["kind"] == "upper bound"
+    assert data["environments"][0]["ceiling"]["kind"] == "upper bound"
     on = GRIDS["rover"].disturbances
     matrix = {(t["trained_on"], t["tested_on"]) for t in data["transfer"]}
     assert matrix == {(on[0], on[1]), (on[1], on[1])}
@@ -130,7 +130,9 @@ def test_in_a_browser(env, runs):
         page.goto((runs[env] / "report.html").as_uri())
         lines = page.locator("#curves .agent-line")
         before = lines.count()
-        assert before == 4 * len(GRIDS[env].disturbances)  # two agents in two panels of each world
+        assert before == 4 * len(
+            GRIDS[env].disturbances
+        )  # two agents in two panels of each environment
 
         # A filter changes the curves; the keyboard does it too.
         page.locator("#filters label", has_text="td3").first.click()

@@ -35,9 +35,9 @@ rtd.evaluate(run.policy(0), env, episodes=2)
 action, _ = run.policy(0).step(run.policy(0).init(), np.zeros(2, np.float32))
 assert np.isfinite(action).all()
 rtd.check_env(env)
-world = rtd.to_gymnasium(env)
-world.reset(seed=0)
-world.step(world.action_space.sample())
+environment = rtd.to_gymnasium(env)
+environment.reset(seed=0)
+environment.step(environment.action_space.sample())
 command = "--env rover --disturbances ar1-slip --algorithms td3 --seeds 1 --final-episodes 2"
 flags = [f"--{name.replace('_', '-')}={value}" for name, value in tiny.items()]
 sys.exit(sweep.main([*command.split(), *flags, "--quiet", "--no-report", "--out", sys.argv[1]]))

@@ -122,7 +122,7 @@ def test_another_configuration_is_refused_with_the_difference(stopped, change, m
         _train(stopped, dataclasses.replace(CONFIG, **change))
 
 
-def test_another_world_or_version_is_refused(stopped, monkeypatch):
+def test_another_environment_or_version_is_refused(stopped, monkeypatch):
     with pytest.raises(rtd.UserError, match="another identity .params"):
         _train(stopped, env=rtd.make("rover", disturbance="ar1-slip-fast"))
     from rtd3jax.training import checkpoint

@@ -1,4 +1,4 @@
-"""Our worlds as Gymnasium environments: one at a time, numpy in and out, seeded by reset.
+"""Our environments as Gymnasium environments: one at a time, numpy in and out, seeded by reset.
 
 gymnasium is imported by gymnax already, so that nothing here makes importing rtd3jax slower.
 """
@@ -68,7 +68,7 @@ class GymnasiumEnv(gymnasium.Env):
             )
         self.render_mode = render_mode
         self._episode: Any = None
-        self.world = env
+        self.environment = env
         self.params = parameters_of(env, params)
         self.action_space, self.observation_space = _spaces(env, self.params)
         self._key: Any = None
@@ -84,13 +84,13 @@ class GymnasiumEnv(gymnasium.Env):
         super().reset(seed=seed)
         self._key = np.uint32(self.np_random.integers(2**32, dtype=np.uint32))
         self._time, self._over = 0, False
-        observation, self._state = _reset(self.world, self.params, self._key)
+        observation, self._state = _reset(self.environment, self.params, self._key)
         observation = self._observation(observation)
         if self.render_mode is not None:
             if self._episode is None:
                 from rtd3jax.envs.compat.frames import Episode
 
-                self._episode = Episode(self.world, self.params)
+                self._episode = Episode(self.environment, self.params)
             self._episode.begin(observation, self._state)
         return observation, {}
 
@@ -102,7 +102,7 @@ class GymnasiumEnv(gymnasium.Env):
         action = np.asarray(action, self.action_space.dtype).reshape(self.action_space.shape)
         time = np.uint32(self._time)
         final, self._state, reward, terminated, truncated, info = _step(
-            self.world, self.params, self._key, time, self._state, action
+            self.environment, self.params, self._key, time, self._state, action
         )
         self._time += 1
         self._over = bool(terminated) or bool(truncated)
@@ -196,7 +196,7 @@ def gymnasium_id(env_id: str, disturbance: str) -> str:
 
 
 def register_with_gymnasium() -> None:
-    """Register every world with each of its disturbances; makes and imports nothing."""
+    """Register every environment with each of its disturbances; makes and imports nothing."""
     for env_id, disturbances in DISTURBANCES.items():
         for disturbance in disturbances:
             if gymnasium_id(env_id, disturbance) not in gymnasium.registry:

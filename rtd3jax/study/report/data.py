@@ -53,7 +53,7 @@ def study_data(
     """
     log = read_log(directory.path / LOG)
     curves = _with_log(curves, log, directory)
-    worlds = list(dict.fromkeys((cell.env, cell.disturbance) for cell in directory.cells))
+    environments = list(dict.fromkeys((cell.env, cell.disturbance) for cell in directory.cells))
     algorithms = ordered(cell.config.algorithm for cell in directory.cells)
     measures = [m for m in MEASURES if m == "return" or _differs(curves, episodes)]
     ledger = _ledger(directory, notes)
@@ -64,14 +64,14 @@ def study_data(
         "title": directory.path.resolve().name,
         "metrics": sorted(metrics["metric"].unique()),
         "measures": [[name, MEASURES[name]] for name in measures],
-        "worlds": [
+        "environments": [
             {
                 "env": env,
                 "disturbance": disturbance,
                 "references": _references(episodes, env, disturbance, measures),
                 "ceiling": None,
             }
-            for env, disturbance in worlds
+            for env, disturbance in environments
         ],
         "agents": [
             {
@@ -83,7 +83,7 @@ def study_data(
         ],
         "cells": [
             {
-                "world": worlds.index((cell.env, cell.disturbance)),
+                "environment": environments.index((cell.env, cell.disturbance)),
                 "agent": algorithms.index(cell.config.algorithm),
                 "length": cell.config.history_length,
                 "seeds": len(directory.seeds),

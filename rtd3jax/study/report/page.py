@@ -81,8 +81,8 @@ def page_data(directory: RunDirectory, *, complete: bool, playback: bool) -> dic
     lanes = seed_means(episodes)
     data = study_data(directory, curves, episodes, metrics, lanes, notes)
     ceilings = ceilings_of(directory.path, directory.cells, compute=complete)
-    for world in data["worlds"]:
-        world["ceiling"] = ceilings.get((world["env"], world["disturbance"]))
+    for environment in data["environments"]:
+        environment["ceiling"] = ceilings.get((environment["env"], environment["disturbance"]))
     try:
         data["transfer"] = transfer_data(directory.path / TRANSFER)
     except UserError as error:

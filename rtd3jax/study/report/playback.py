@@ -31,7 +31,7 @@ from rtd3jax.system.files import write_bytes_atomically
 FORMAT = 2
 EPISODES = 2
 SEED = 0
-"""Of the episodes, the same for all agents: in one world they meet the same disturbance."""
+"""Of the episodes, the same for all agents: in one environment they meet the same disturbance."""
 MOST_STEPS = 500
 """Steps of an episode that are kept."""
 MOST_CELLS = 60

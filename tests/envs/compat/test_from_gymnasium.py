@@ -81,7 +81,7 @@ def make(**kwargs):
     return Cart(**kwargs)
 
 
-def world(**kwargs):
+def environment(**kwargs):
     return rtd.from_gymnasium(make, keep=[0, 2], max_steps_in_episode=12, **kwargs)
 
 
@@ -118,12 +118,12 @@ def test_a_program_plays_what_a_loop_plays():
 def test_lanes_train_and_all_simulators_are_closed(strategy):
     close_simulators()
     made, closed = Cart.made, Cart.closed
-    run = rtd.train(world(), SMALL, seeds=range(2), progress=False, strategy=strategy)
+    run = rtd.train(environment(), SMALL, seeds=range(2), progress=False, strategy=strategy)
     assert np.isfinite(run.returns).all() and not run.failures
     # One to be looked at, one for each lane; those of evaluations may serve both lanes.
     assert 1 + 2 + 2 <= Cart.made - made <= 1 + 2 + 4
     assert Cart.closed - closed == Cart.made - made
-    again = rtd.train(world(), SMALL, seeds=range(2), progress=False, strategy=strategy)
+    again = rtd.train(environment(), SMALL, seeds=range(2), progress=False, strategy=strategy)
     np.testing.assert_array_equal(run.returns, again.returns)
 
 
@@ -138,8 +138,8 @@ def test_side_by_side_episodes_are_those_one_by_one():
 
 @pytest.mark.slow
 def test_a_simulator_composes_with_a_disturbance_and_is_reset_at_ends_alone():
-    env = rtd.disturb(world(), rtd.Delay())
-    rtd.check_env(world())
+    env = rtd.disturb(environment(), rtd.Delay())
+    rtd.check_env(environment())
     config = dataclasses.replace(SMALL, environments=2)
     run = rtd.train(env, config, seeds=[0], progress=False)
     assert np.isfinite(run.returns).all()
@@ -158,7 +158,7 @@ def test_a_simulator_composes_with_a_disturbance_and_is_reset_at_ends_alone():
     ],
 )
 def test_a_simulator_that_fails_says_how_and_stays_lost(fault, message):
-    fleet = world(fault=fault, at=2, step_seconds=0.3).fleet
+    fleet = environment(fault=fault, at=2, step_seconds=0.3).fleet
     handle, _, _ = fleet.reset(-1, 5)
     place = fleet._busy[handle].place
     action = np.zeros(2, np.float32)
@@ -193,7 +193,7 @@ def test_resumed_lanes_end_with_the_same_bits(tmp_path, noise):
     from rtd3jax.training.loop import revived
     from rtd3jax.training.run import make_jobs
 
-    (job,) = make_jobs(world(noise=noise), SMALL, [0])
+    (job,) = make_jobs(environment(noise=noise), SMALL, [0])
     program, lane = job.program, job.lane
     advance = jax.jit(program.advance)
     state = advance(lane, jax.jit(program.init)(lane), jnp.int32(0), jnp.int32(33))

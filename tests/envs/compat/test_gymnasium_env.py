@@ -1,4 +1,4 @@
-"""Our worlds under Gymnasium's own checker, and by its rules about ends and seeds."""
+"""Our environments under Gymnasium's own checker, and by its rules about ends and seeds."""
 
 import gc
 import subprocess
@@ -52,7 +52,7 @@ class Falling(environment.Environment):
     "env_id",
     [gymnasium_id("pendulum", "random-sine"), gymnasium_id("rover", "ar1-slip")],
 )
-def test_gymnasiums_checker_is_content_with_registered_worlds(env_id):
+def test_gymnasiums_checker_is_content_with_registered_environments(env_id):
     env = gymnasium.make(env_id)
     with warnings.catch_warnings():
         # It would like bounded observations and actions within one: advice, not rules.
@@ -69,7 +69,7 @@ def test_it_is_content_with_gymnaxs_own(env_id):
         check_env(rtd.to_gymnasium(rtd.make(env_id)))
 
 
-def test_every_world_and_disturbance_is_registered():
+def test_every_environment_and_disturbance_is_registered():
     for env_id, disturbances in rtd.DISTURBANCES.items():
         for disturbance in disturbances:
             assert gymnasium_id(env_id, disturbance) in gymnasium.registry
@@ -207,10 +207,10 @@ def test_an_episode_is_drawn_until_its_last_step(env_id):
     if "/" in env_id:
         env = gymnasium.make(env_id, render_mode="rgb_array", max_steps_in_episode=3)
     else:
-        world = rtd.make("pendulum", "delay", steps=2)
-        params = world.default_params
+        environment = rtd.make("pendulum", "delay", steps=2)
+        params = environment.default_params
         params = params.replace(env=params.env.replace(max_steps_in_episode=3))
-        env = rtd.to_gymnasium(world, params=params, render_mode="rgb_array")
+        env = rtd.to_gymnasium(environment, params=params, render_mode="rgb_array")
     env.reset(seed=0)
     frames, over = [env.render()], False
     while not over:
@@ -234,7 +234,7 @@ def test_what_has_no_drawing_shows_its_signals():
 
 def test_the_pendulum_stands_where_its_angle_says():
     env = rtd.to_gymnasium(rtd.make("pendulum"))
-    episode = Episode(env.world, env.params)
+    episode = Episode(env.environment, env.params)
     for angle, right in ((np.pi / 2, False), (-np.pi / 2, True)):
         episode.begin(np.zeros(3), types.SimpleNamespace(theta=angle, theta_dot=0.0))
         blue = np.all(episode.frame()[:, :310] == (0, 114, 178), axis=-1)
@@ -294,10 +294,10 @@ def test_spaces_are_kept_as_long_as_their_environment(monkeypatch):
     monkeypatch.setattr(gymnasium_env, "_seen", {})
     monkeypatch.setattr(gymnasium_env, "_MOST_SEEN", 3)
     for _ in range(2):
-        world = Uncached()
-        made = rtd.to_gymnasium(world)
-        assert list(gymnasium_env._seen) == [id(world)]
-        del made, world
+        environment = Uncached()
+        made = rtd.to_gymnasium(environment)
+        assert list(gymnasium_env._seen) == [id(environment)]
+        del made, environment
         gc.collect()
         assert not gymnasium_env._seen
     for steps in range(5):
@@ -306,11 +306,11 @@ def test_spaces_are_kept_as_long_as_their_environment(monkeypatch):
 
 
 def test_a_forked_process_is_told_to_spawn(monkeypatch):
-    world, name = rtd.make("rover"), "rtd3jax/Rover-ar1-slip-v0"
-    env, named = rtd.to_gymnasium(world), gymnasium.make(name)
+    environment, name = rtd.make("rover"), "rtd3jax/Rover-ar1-slip-v0"
+    env, named = rtd.to_gymnasium(environment), gymnasium.make(name)
     env.reset(seed=0)
     monkeypatch.setattr(gymnasium_env, "_PROCESS", -1)
-    for forked in (env, rtd.to_gymnasium(world), gymnasium.make(name)):
+    for forked in (env, rtd.to_gymnasium(environment), gymnasium.make(name)):
         assert forked.observation_space == named.observation_space
         with pytest.raises(UserError, match='context="spawn"') as caught:
             forked.reset(seed=0)

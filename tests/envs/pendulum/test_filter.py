@@ -73,7 +73,7 @@ def test_under_noise_it_earns_most_of_what_there_is():
     assert -350 < float(jnp.mean(returns)) < -150
 
 
-def test_other_worlds_are_refused_in_one_line():
+def test_other_environments_are_refused_in_one_line():
     with pytest.raises(rtd.UserError, match="pendulum alone"):
         rtd.filter_policy(rtd.make("rover"))
     with pytest.raises(rtd.UserError, match="does not cover Pulses"):

@@ -264,7 +264,7 @@ def test_the_channels_and_their_members_have_streams_of_their_own():
 
 @pytest.mark.parametrize("name", FAULTS)
 @pytest.mark.parametrize("env_id", ["pendulum", "rover", "MountainCarContinuous-v0"])
-def test_faults_are_known_by_name_on_any_world(env_id, name):
+def test_faults_are_known_by_name_on_any_environment(env_id, name):
     env = make(env_id, name)
     assert isinstance(env, Disturbed)
     params = env.default_params

@@ -31,11 +31,11 @@ function limits(values, references) {
 
 const DASHES = { random: '2 3', constant: '8 4', ceiling: null };
 
-function referencesOf(world, measure) {
-  const found = world.references.map((r) => ({ name: r.name, value: r[measure] }));
-  if (world.ceiling && finite(world.ceiling.mean)) {
-    const name = world.ceiling.kind === 'exact' ? 'ceiling' : 'ceiling (upper bound)';
-    found.push({ name, value: world.ceiling.mean, ceiling: true });
+function referencesOf(environment, measure) {
+  const found = environment.references.map((r) => ({ name: r.name, value: r[measure] }));
+  if (environment.ceiling && finite(environment.ceiling.mean)) {
+    const name = environment.ceiling.kind === 'exact' ? 'ceiling' : 'ceiling (upper bound)';
+    found.push({ name, value: environment.ceiling.mean, ceiling: true });
   }
   return found.filter((r) => finite(r.value));
 }

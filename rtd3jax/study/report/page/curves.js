@@ -2,13 +2,13 @@
 
 function curvePanels() {
   const panels = [];
-  DATA.worlds.forEach((world, index) => {
-    const cells = shownCells().filter((cell) => cell.world === index);
+  DATA.environments.forEach((environment, index) => {
+    const cells = shownCells().filter((cell) => cell.environment === index);
     if (!cells.length) return;
     const lengths = [...new Set(cells.map((cell) => cell.length))].filter(Boolean).sort((a, b) => a - b);
-    const references = referencesOf(world, state.measure);
+    const references = referencesOf(environment, state.measure);
     const curves = cells.map((cell) => cell.curves[state.measure]).filter(Boolean);
-    // One range for all lengths of a world, so that its panels can be compared. Early returns may
+    // One range for all lengths of an environment, so that its panels can be compared. Early returns may
     // be a hundred times worse than late ones: the lowest tenth of a curve's points may be cut off.
     const lows = curves.flatMap((curve) => curve.low.map((low, k) => (finite(low) ? low : curve.iqm[k])));
     const floor = quantile(lows, 0.1);
@@ -16,7 +16,7 @@ function curvePanels() {
     const range = { ...limits(kept, references), cut: Math.min(...lows.filter(finite)) < floor };
     for (const length of lengths.length ? lengths : [0]) {
       const here = cells.filter((cell) => cell.length === 0 || cell.length === length);
-      panels.push({ world, length, cells: here, range });
+      panels.push({ environment, length, cells: here, range });
     }
   });
   return panels;
@@ -57,8 +57,8 @@ function legendItems(panels) {
   return items;
 }
 
-function curvePanel({ world, length, cells, range, title: given }, width) {
-  const title = given ?? [worldName(world), length ? lengthName(length) : null].filter(Boolean).join(', ');
+function curvePanel({ environment, length, cells, range, title: given }, width) {
+  const title = given ?? [environmentName(environment), length ? lengthName(length) : null].filter(Boolean).join(', ');
   const drawn = cells.filter((cell) => cell.curves[state.measure]);
   const figure = el('figure', {}, el('figcaption', {}, title));
   if (!drawn.length) {

@@ -1,11 +1,11 @@
-// What is shown: sets of worlds, agents and history lengths, shared by curves, returns and table.
+// What is shown: sets of environments, agents and history lengths, shared by curves, returns and table.
 
-const state = { worlds: new Set(), agents: new Set(), lengths: new Set(), measure: 'return' };
+const state = { environments: new Set(), agents: new Set(), lengths: new Set(), measure: 'return' };
 
-const oneEnv = new Set(DATA.worlds.map((world) => world.env)).size === 1;
-function worldName(world) {
-  const name = world.disturbance === 'none' ? 'no disturbance' : world.disturbance;
-  return oneEnv ? name : `${world.env}: ${name}`;
+const oneEnv = new Set(DATA.environments.map((environment) => environment.env)).size === 1;
+function environmentName(environment) {
+  const name = environment.disturbance === 'none' ? 'no disturbance' : environment.disturbance;
+  return oneEnv ? name : `${environment.env}: ${name}`;
 }
 const lengthName = (length) => `history ${length}`;
 const cellName = (cell) =>
@@ -14,7 +14,7 @@ const allLengths = [...new Set(DATA.cells.map((cell) => cell.length))].filter(Bo
 
 // An agent without a window belongs beside every length.
 const isShown = (cell) =>
-  state.worlds.has(cell.world) && state.agents.has(cell.agent) &&
+  state.environments.has(cell.environment) && state.agents.has(cell.agent) &&
   (cell.length === 0 || state.lengths.has(cell.length));
 const shownCells = () => DATA.cells.filter(isShown);
 
@@ -54,13 +54,13 @@ function measureChoice(update) {
 function startFilters(update) {
   DATA.agents.forEach((_, index) => state.agents.add(index));
   allLengths.forEach((length) => state.lengths.add(length));
-  // A large study opens on its first worlds: some dozen panels.
+  // A large study opens on its first environments: some dozen panels.
   const panels = Math.max(1, allLengths.length);
   const first = Math.max(1, Math.floor(12 / panels));
-  DATA.worlds.forEach((_, index) => { if (index < first) state.worlds.add(index); });
+  DATA.environments.forEach((_, index) => { if (index < first) state.environments.add(index); });
   const form = byId('filters').querySelector('form');
   form.addEventListener('submit', (event) => event.preventDefault());
-  form.append(chips('disturbance', state.worlds, DATA.worlds.map((world, value) => ({ value, label: worldName(world) })), update));
+  form.append(chips('disturbance', state.environments, DATA.environments.map((environment, value) => ({ value, label: environmentName(environment) })), update));
   form.append(chips('agent', state.agents, DATA.agents.map((agent, value) => ({ value, label: agent.name, agent: value })), update));
   if (allLengths.length) {
     form.append(chips('history length', state.lengths, allLengths.map((value) => ({ value, label: String(value) })), update));

@@ -6,8 +6,8 @@ function drawFinals() {
     `The trained policies over ${plural(DATA.study.episodes, 'episode')} per seed: small dots are seeds, ` +
     'the large one is their interquartile mean with its 95 % bootstrap interval.';
   const body = section.querySelector('.body');
-  const panels = DATA.worlds
-    .map((world, index) => ({ world, cells: shownCells().filter((cell) => cell.world === index && cell.final[state.measure]) }))
+  const panels = DATA.environments
+    .map((environment, index) => ({ environment, cells: shownCells().filter((cell) => cell.environment === index && cell.final[state.measure]) }))
     .filter(({ cells }) => cells.length);
   if (!panels.length) {
     body.replaceChildren(el('p', { class: 'missing' }, 'No lane of what is selected has ended yet.'));
@@ -16,20 +16,20 @@ function drawFinals() {
   panelGrid(body, panels, 430, finalPanel);
 }
 
-function finalPanel({ world, cells }, width) {
+function finalPanel({ environment, cells }, width) {
   const rows = [...cells].sort((a, b) => a.agent - b.agent || a.length - b.length);
   const values = rows.flatMap((cell) => {
     const final = cell.final[state.measure];
     return [...final.values, final.low, final.high];
   });
-  const range = limits(values, referencesOf(world, state.measure));
+  const range = limits(values, referencesOf(environment, state.measure));
   const names = rows.map(cellName);
   const left = Math.min(width * 0.45, 18 + 6.3 * Math.max(...names.map((name) => name.length)));
   const line = 24;
   const height = rows.length * line + 34 + 13 * range.far.length;
   const right = width - 16;
   const x = scale(range.low, range.high, left, right);
-  const label = `Final returns, ${worldName(world)}`;
+  const label = `Final returns, ${environmentName(environment)}`;
   const svg = draw('svg', { class: 'plot', width, height, viewBox: `0 0 ${width} ${height}`, role: 'img', 'aria-label': label });
   const marks = ticks(range.low, range.high, Math.max(2, Math.floor((right - left) / 80)));
   const bottom = rows.length * line + 8;
@@ -46,7 +46,7 @@ function finalPanel({ world, cells }, width) {
   range.far.forEach((reference, k) => {
     svg.append(draw('text', { class: 'note', x: right, y: bottom + 28 + 13 * k, 'text-anchor': 'end' }, farWords(reference, marks.decimals)));
   });
-  return el('figure', {}, el('figcaption', {}, worldName(world)), svg);
+  return el('figure', {}, el('figcaption', {}, environmentName(environment)), svg);
 }
 
 function finalRow(cell, name, y, x, left, right) {

@@ -3,16 +3,16 @@
 function learningPanels() {
   const panels = [];
   for (const metric of DATA.metrics) {
-    DATA.worlds.forEach((world, index) => {
-      const cells = shownCells().filter((cell) => cell.world === index && cell.learning[metric]);
+    DATA.environments.forEach((environment, index) => {
+      const cells = shownCells().filter((cell) => cell.environment === index && cell.learning[metric]);
       const lengths = [...new Set(cells.map((cell) => cell.length))].filter(Boolean).sort((a, b) => a - b);
       for (const length of lengths.length ? lengths : [0]) {
         const here = cells.filter((cell) => cell.length === 0 || cell.length === length)
           .map((cell) => ({ ...cell, curves: { [state.measure]: cell.learning[metric] } }));
         if (!here.length) continue;
         const values = here.flatMap((cell) => cell.curves[state.measure].iqm);
-        const title = [metric.replaceAll('_', ' '), worldName(world), length ? lengthName(length) : null].filter(Boolean).join(', ');
-        panels.push({ world, length, cells: here, range: limits(values, []), title });
+        const title = [metric.replaceAll('_', ' '), environmentName(environment), length ? lengthName(length) : null].filter(Boolean).join(', ');
+        panels.push({ environment, length, cells: here, range: limits(values, []), title });
       }
     });
   }

@@ -1,6 +1,6 @@
 // Episode playback: the plant moves, and beneath it run the signals with a cursor at the frame.
 
-const player = { world: 0, cells: [], run: 0, frame: 0, playing: false, speed: 1, stages: [], last: 0 };
+const player = { environment: 0, cells: [], run: 0, frame: 0, playing: false, speed: 1, stages: [], last: 0 };
 const FRAMES_PER_SECOND = 20;
 
 function unpack({ scale: scales, data }) {
@@ -30,11 +30,11 @@ function startPlayback() {
     return;
   }
   about.textContent = 'Trained policies (of the seed with the median return), two side by side; in one ' +
-    'world all agents meet the same episodes. Space plays and stops, the arrow keys step.';
-  const worlds = [...new Set(DATA.playback.map((entry) => DATA.cells[entry.cell].world))];
-  player.world = worlds[0];
-  const worldSelect = selectOf('disturbance', worlds.map((world) => [world, worldName(DATA.worlds[world])]), (value) => {
-    player.world = Number(value);
+    'environment all agents meet the same episodes. Space plays and stops, the arrow keys step.';
+  const environments = [...new Set(DATA.playback.map((entry) => DATA.cells[entry.cell].environment))];
+  player.environment = environments[0];
+  const environmentSelect = selectOf('disturbance', environments.map((environment) => [environment, environmentName(DATA.environments[environment])]), (value) => {
+    player.environment = Number(value);
     chooseDefault();
     rebuild();
   });
@@ -52,7 +52,7 @@ function startPlayback() {
   const clock = el('span', { class: 'clock', id: 'clock' });
   const stages = el('div', { class: 'stages' });
   body.replaceChildren(
-    el('div', { class: 'controls' }, worldSelect.node, cellSelects.map((s) => s.node), runSelect.node),
+    el('div', { class: 'controls' }, environmentSelect.node, cellSelects.map((s) => s.node), runSelect.node),
     el('div', { class: 'controls' }, play, el('label', { class: 'scrub' }, scrub), clock, speedSelect.node),
     stages);
   section.addEventListener('keydown', (event) => {
@@ -62,7 +62,7 @@ function startPlayback() {
     if (move) { event.preventDefault(); player.playing = false; goTo(player.frame + move); }
   });
 
-  const here = () => DATA.playback.filter((entry) => DATA.cells[entry.cell].world === player.world);
+  const here = () => DATA.playback.filter((entry) => DATA.cells[entry.cell].environment === player.environment);
   function chooseDefault() {
     const entries = here();
     const value = (entry) => (DATA.cells[entry.cell].final.return || {}).mean ?? -Infinity;

@@ -3,8 +3,8 @@
 const sorting = { column: null, descending: false };
 
 // How far from the uniform-random policy (0) to the ceiling (1) a return is.
-function normalised(value, world) {
-  const references = referencesOf(world, state.measure);
+function normalised(value, environment) {
+  const references = referencesOf(environment, state.measure);
   const random = references.find((r) => r.name === 'random');
   const best = references.find((r) => r.ceiling);
   return random && best && finite(value) ? (value - random.value) / (best.value - random.value) : null;
@@ -14,7 +14,7 @@ function tableColumns(decimals) {
   const final = (row) => row.final || {};
   const numeric = (name, value, places = decimals) => ({ name, number: true, value, text: (row) => fixed(value(row), places) });
   return [
-    { name: 'disturbance', value: (row) => worldName(row.world), text: (row) => worldName(row.world) },
+    { name: 'disturbance', value: (row) => environmentName(row.environment), text: (row) => environmentName(row.environment) },
     { name: 'policy', value: (row) => row.name, text: (row) => (row.cell ? el('span', { class: 'agent' }, swatch(row.cell.agent), row.name) : row.name) },
     { name: 'history', number: true, value: (row) => (row.cell ? row.cell.length : null), text: (row) => (row.cell ? (row.cell.length || DASH) : DASH) },
     { name: 'seeds', number: true, value: (row) => final(row).n, text: (row) => (row.cell ? `${final(row).n || 0} of ${row.cell.seeds}` : DASH) },
@@ -23,7 +23,7 @@ function tableColumns(decimals) {
       text: (row) => (finite(final(row).low) ? `${fixed(final(row).low, decimals)} to ${fixed(final(row).high, decimals)}` : DASH) },
     numeric('mean', (row) => final(row).mean),
     numeric('std', (row) => final(row).std),
-    numeric('normalised', (row) => normalised(final(row).mean, row.world), 3),
+    numeric('normalised', (row) => normalised(final(row).mean, row.environment), 3),
     { name: 'state', value: (row) => (row.cell ? stateOf(row.cell) : ''), text: (row) => (row.cell ? stateOf(row.cell) : '') },
   ];
 }
@@ -37,11 +37,11 @@ function stateOf(cell) {
 }
 
 function tableRows() {
-  const rows = shownCells().map((cell) => ({ cell, world: DATA.worlds[cell.world], name: DATA.agents[cell.agent].name, final: cell.final[state.measure] }));
-  DATA.worlds.forEach((world, index) => {
-    if (!state.worlds.has(index)) return;
-    for (const reference of referencesOf(world, state.measure)) {
-      rows.push({ cell: null, world, name: reference.name, final: { mean: reference.value, iqm: null } });
+  const rows = shownCells().map((cell) => ({ cell, environment: DATA.environments[cell.environment], name: DATA.agents[cell.agent].name, final: cell.final[state.measure] }));
+  DATA.environments.forEach((environment, index) => {
+    if (!state.environments.has(index)) return;
+    for (const reference of referencesOf(environment, state.measure)) {
+      rows.push({ cell: null, environment, name: reference.name, final: { mean: reference.value, iqm: null } });
     }
   });
   return rows;

@@ -1,4 +1,4 @@
-"""A world that the library does not know, with real terminations, trains as it is."""
+"""An environment that the library does not know, with real terminations, trains as it is."""
 
 import jax
 import jax.numpy as jnp
@@ -37,7 +37,7 @@ class Cart(environment.Environment):
         return spaces.Box(-1.0, 1.0, (1,))
 
 
-def test_a_new_world_trains_and_its_terminations_count():
+def test_a_new_environment_trains_and_its_terminations_count():
     env = Cart()
     config = rtd.Config(
         algorithm="lstm-td3-1ha2hc",

@@ -1,4 +1,4 @@
-"""The PyTorch reference's world and replay, in numpy: the rover under AR(1) slip, and a ring.
+"""The PyTorch reference's environment and replay, in numpy: the rover under AR(1) slip, and a ring.
 
 Shapes: ``C`` capacity, ``B`` batch, ``L`` past tokens, ``O`` and ``A`` sizes of an observation and
 an action, ``H`` width. A token is a row (previous action | observation | action) of W = O + 2 A
