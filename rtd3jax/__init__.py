@@ -1,19 +1,19 @@
 """Recurrent TD3 agents for plants whose disturbance is hidden and evolves."""
 
-import rtd3jax.system.switches  # noqa: F401 - first: it imports gymnax where switches forbid that
+import rtd3jax.system.switches  # noqa: F401 - first: it imports gymnax
 from rtd3jax.agents.agent import Agent, count_parameters, make_agent
 from rtd3jax.agents.learners import register_learner
 from rtd3jax.agents.memory import Memory, register_memory
 from rtd3jax.agents.networks import NetworkSpec
 from rtd3jax.agents.variants import ALGORITHMS, Variant, register_agent
 from rtd3jax.config import Config
-from rtd3jax.envs.about import Ceiling, Drawing
 from rtd3jax.envs.builtin import DISTURBANCES, ENVIRONMENTS
 from rtd3jax.envs.check import Finding, check_env, find_problems
 from rtd3jax.envs.compat.brax import from_brax
 from rtd3jax.envs.compat.from_gymnasium import from_gymnasium
 from rtd3jax.envs.compat.gymnasium import register_with_gymnasium, to_gymnasium
 from rtd3jax.envs.controllers import function_policy, lqr_policy, pid_policy
+from rtd3jax.envs.description import Ceiling, Drawing
 from rtd3jax.envs.disturbed import disturb
 from rtd3jax.envs.identity import ValueIdentity
 from rtd3jax.envs.pendulum.filter import filter_policy
@@ -116,7 +116,7 @@ register_with_gymnasium()
 
 
 def __getattr__(name: str) -> object:
-    """`Study`, with which pandas and matplotlib come, is imported when it is asked for."""
+    """Import `Study` only when it is used: it imports pandas and matplotlib."""
     if name == "Study":
         from rtd3jax.study.study import Study
 

@@ -1,4 +1,4 @@
-"""``python -m rtd3jax``: what this installation has, by name."""
+"""``python -m rtd3jax``: list the commands, environments, agents and memories by name."""
 
 import argparse
 import ast
@@ -20,14 +20,15 @@ _WIDTH = 79
 _FOLDER = str(pathlib.Path(__file__).parent / "cli")
 _PACKAGES = ("rtd3jax", "jax", "flax", "gymnax")
 _MARK = "``python -m rtd3jax."
-"""How the docstring of a command begins: the name and "``: " follow, then what it does."""
+"""How the docstring of a command's module begins: then come the name, "``: " and the purpose."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; the exit status: 0 done, 2 bad input."""
     show_what_can_be_shown()
     parser = argparse.ArgumentParser(
-        prog="python -m rtd3jax", description="Say what this installation of rtd3jax has."
+        prog="python -m rtd3jax",
+        description="List what this installation of rtd3jax offers, by name.",
     )
     versions = [f"{name} {version}" for name, version in versions_of(_PACKAGES).items()]
     parser.add_argument("--version", action="version", version=versions[0])
@@ -46,14 +47,14 @@ def _lines() -> Iterator[str]:
     for env, disturbances in DISTURBANCES.items():
         yield from _listed(env, (name for name in disturbances if name not in FAULTS))
     yield from _listed("any", FAULTS)
-    yield "  gymnax's environments can be made by name; rtd3jax.register adds others."
+    yield "  rtd3jax.make also makes gymnax's environments; rtd3jax.register adds others."
     yield ""
     yield from _listed("Agents", AGENTS, indent="")
     yield from _listed("Memories", MEMORIES, indent="")
 
 
 def commands() -> dict[str, str]:
-    """Every command's purpose, by name: the first sentence of its module, which is not imported."""
+    """Each command's purpose: the first line of its module's docstring. No module is imported."""
     found = {}
     for module in pkgutil.iter_modules([_FOLDER], "rtd3jax.cli."):
         spec = module.module_finder.find_spec(module.name, None)
@@ -67,7 +68,7 @@ def commands() -> dict[str, str]:
 
 
 def _listed(title: str, names: Iterable[str], indent: str = "  ") -> list[str]:
-    """``title: name, name, ...`` in lines that fit a terminal."""
+    """``title: name, name, ...``, wrapped to the width of a terminal."""
     hanging = indent + "  "
     return textwrap.wrap(
         f"{title}: {', '.join(names)}",

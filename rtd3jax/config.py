@@ -1,7 +1,7 @@
 """The configuration of one agent's training: every field, its default and the reason for it.
 
-The command line, the saved ``config.json`` and the documentation are derived from these fields, so
-that a hyper-parameter is written once. The paper states no hyper-parameters; the defaults are those
+The flags of the command line, ``config.json`` and the documentation are made from these fields, so
+each hyper-parameter is defined once. The paper states no hyper-parameters; the defaults are those
 of the published TD3 (Fujimoto et al., 2018) and LSTM-TD3 (Meng et al., 2021).
 """
 
@@ -22,9 +22,9 @@ DEFAULT_SEGMENT_LENGTH = 10
 
 
 def _field(default: object, help: str, *, traced: bool = False, low: float, high: float = math.inf):
-    """A configuration field. Lanes of one program may differ in those that are ``traced``.
+    """A field of the configuration, with its help and its inclusive bounds ``low`` and ``high``.
 
-    ``low`` and ``high`` are the inclusive bounds of the values that make sense.
+    Lanes that share a compiled program may differ in the fields that are ``traced``.
     """
     return dataclasses.field(
         default=default, metadata={"help": help, "traced": traced, "low": low, "high": high}
@@ -33,38 +33,42 @@ def _field(default: object, help: str, *, traced: bool = False, low: float, high
 
 WINDOWS_WITH_CARRY = (
     "acting='carry' with replay='windows': a memory that was trained on windows has never seen a "
-    "carry older than its window; on the pendulum under 'hidden' returns fell from 0.98 to 0.71 of "
-    "the optimum at history_length=6 (docs/how_it_is_fast.md); train with replay='segments', or "
-    "act with windows"
+    "carry older than its window; on the pendulum under 'hidden', returns fell from 0.98 to 0.71 "
+    "of the optimum at history_length=6 (docs/how_it_is_fast.md); train with replay='segments', or "
+    "use acting='window'"
 )
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Everything that determines one agent's training, except the environment and the seed.
+    """All settings of one agent's training, except the environment and the seed.
 
     Raises:
-        UserError: when a value is impossible, naming the field and the remedy.
+        UserError: when a value is impossible; the message names the field and the remedy.
     """
 
     algorithm: str = dataclasses.field(
         default="lstm-td3-1ha1hc",
-        metadata={"help": "the agent; rtd3jax.agents.variants says what each reads"},
+        metadata={"help": "the agent; rtd3jax.agents.variants lists the inputs of each"},
     )
     history_length: int | None = _field(
         None,
-        "past steps in a window, l in the paper; 0 for agents without one "
+        "past steps in a window, l in the paper; 0 for agents without a window "
         f"[{DEFAULT_HISTORY_LENGTH}]",
         low=1,
     )
     total_steps: int = _field(30_000, "environment steps of a lane", low=1)
     hidden_size: int = _field(128, "width H of every layer (the paper's Table: 128)", low=1)
     batch_size: int = _field(100, "transitions in an update (LSTM-TD3: 100)", low=1)
-    actor_learning_rate: float = _field(1e-3, "Adam's step for the actor", traced=True, low=0)
-    critic_learning_rate: float = _field(1e-3, "Adam's step for the critics", traced=True, low=0)
+    actor_learning_rate: float = _field(
+        1e-3, "learning rate of Adam for the actor", traced=True, low=0
+    )
+    critic_learning_rate: float = _field(
+        1e-3, "learning rate of Adam for the critics", traced=True, low=0
+    )
     final_learning_rate_fraction: float = _field(
         1.0,
-        "share of both learning rates that is left at the last step; they fall linearly",
+        "fraction of both learning rates at the last step; the rates fall linearly",
         traced=True,
         low=0,
         high=1,
@@ -72,12 +76,12 @@ class Config:
     gamma: float = _field(0.99, "discount factor", traced=True, low=0, high=1)
     reward_scale: float = _field(
         1.0,
-        "factor of the rewards that are learned from; returns are reported without it",
+        "factor of the rewards in updates; returns are reported without this factor",
         traced=True,
         low=0,
     )
     tau: float = _field(
-        0.005, "share of the online weights in a target update", traced=True, low=0, high=1
+        0.005, "fraction of the online weights in a target update", traced=True, low=0, high=1
     )
     exploration_noise: float = _field(
         0.1, "standard deviation of the acting noise, in half action ranges", traced=True, low=0
@@ -90,40 +94,45 @@ class Config:
     )
     actor_noise: float = _field(
         0.0,
-        "standard deviation of the noise on the actions whose value the actor climbs, in half "
-        "ranges (TD3: 0); as wide as the exploration, the critic's kinks average out",
+        "standard deviation of the noise that is added to the actor's actions in its loss, in half "
+        "ranges (TD3: 0); noise as wide as exploration_noise smooths the critic",
         traced=True,
         low=0,
     )
     update_every: int = _field(
         1,
-        "environment steps per critic update (TD3: 1); with more, rewards' luck is fitted less; "
-        "with fewer than environments, several updates follow each step of them",
+        "environment steps per critic update (TD3: 1); with more steps, the critics fit the noise "
+        "of rewards less; with fewer steps than environments, several updates follow each step of "
+        "all environments",
         low=1,
     )
     environments: int = _field(
         1,
-        "environments that feed one learner side by side, each a transition a step; steps are "
-        "counted over all of them",
+        "environments that step together and feed one learner; every count of steps is a sum over "
+        "all of them",
         low=1,
     )
     policy_delay: int = _field(2, "critic updates per actor and target update", low=1)
     learning_starts: int = _field(
-        1_000, "uniform-random steps before the first update; at least batch_size", low=1
+        1_000,
+        "steps with uniformly random actions before the first update; at least batch_size",
+        low=1,
     )
     replay_capacity: int | None = _field(
-        None, "transitions kept; the oldest leave first [total_steps]", low=1
+        None, "transitions in the replay; the oldest are replaced first [total_steps]", low=1
     )
     memory: str = dataclasses.field(
         default="lstm",
-        metadata={"help": "the recurrent cell: lstm (the paper's), gru, min-gru, or your own"},
+        metadata={
+            "help": "the recurrent cell: lstm (the paper's), gru, min-gru, or a registered one"
+        },
     )
     replay: str = dataclasses.field(
         default="windows",
         metadata={
-            "help": "what a batch is cut into: windows (the paper's), a history for each "
-            "transition; or segments, whose tokens serve all the transitions after them: faster "
-            "the longer the history"
+            "help": "how the histories of a batch are read: windows (the paper's), a separate "
+            "history for each transition; or segments, consecutive transitions that share one "
+            "history, which is faster for long histories"
         },
     )
     segment_length: int | None = _field(
@@ -135,53 +144,55 @@ class Config:
     burn_in_gradient: bool = dataclasses.field(
         default=False,
         metadata={
-            "help": "whether a segment's gradient flows back into its burn-in, the history_length "
-            "steps before it; it costs time and brought nothing (experiments/segments_returns.py)"
+            "help": "whether the gradient of a segment flows into its burn-in, the history_length "
+            "steps before it; this took more time and did not raise returns "
+            "(experiments/segments_returns.py)"
         },
     )
     acting: str | None = dataclasses.field(
         default=None,
         metadata={
-            "help": "how the agent acts: window reads the last steps anew at every step; carry "
-            "goes on with the memory's carry from the episode's start [carry with segments, else "
-            "window]"
+            "help": "how the agent acts: window computes the memory from the last steps at every "
+            "step; carry updates the memory's carry from the start of the episode [carry with "
+            "segments, else window]"
         },
     )
     normalise_observations: bool = dataclasses.field(
         default=False,
         metadata={
-            "help": "whether networks read each element of an observation in running deviations "
-            "about its running mean; for plants whose elements differ much in size"
+            "help": "whether networks read observations normalised by running means and standard "
+            "deviations; for plants whose observation elements differ much in size"
         },
     )
     start: str = dataclasses.field(
         default="",
         metadata={
-            "help": "what training goes on from: a saved policy, or a run directory, whose lane of "
-            "the same agent and seed it is; RUN@DISTURBANCE says of which disturbance [new weights]"
+            "help": "networks from which training starts: a saved policy, or a run directory with "
+            "a lane of the same agent and seed; RUN@DISTURBANCE names the lane's disturbance "
+            "[new weights]"
         },
     )
     freeze: str = dataclasses.field(
         default="",
         metadata={
-            "help": "parts of the networks whose weights stay as they began, with commas between "
-            "them: actor, critics, or a layer of one, such as actor.memory [none]"
+            "help": "parts of the networks whose weights are not trained, separated by commas: "
+            "actor, critics, or a layer of these, such as actor.memory [none]"
         },
     )
     actor_starts: int | None = _field(
         None,
-        "environment step from which on td3's learner updates the actor, where its critics must "
+        "environment step at which the td3 learner begins to update the actor, if the critics must "
         "learn first [learning_starts]",
         low=0,
     )
     precision: str = dataclasses.field(
         default="float32",
         metadata={
-            "help": "of the factors of wide products in updates: float32, bfloat16",
+            "help": "precision of large matrix products in updates: float32, bfloat16",
         },
     )
     eval_every: int = _field(1_000, "environment steps between evaluations", low=1)
-    eval_episodes: int = _field(10, "episodes of an evaluation", low=1)
+    eval_episodes: int = _field(10, "episodes in an evaluation", low=1)
 
     def __post_init__(self) -> None:
         AGENTS.check(self.algorithm)
@@ -189,7 +200,7 @@ class Config:
         if self.precision not in PRECISIONS:
             raise UserError(
                 f"precision {self.precision!r} is unknown{nearest(str(self.precision), PRECISIONS)}"
-                f"; there are {' and '.join(PRECISIONS)}"
+                f"; choose {' or '.join(PRECISIONS)}"
             )
         self._resolve_history_length()
         self._resolve_replay()
@@ -211,18 +222,18 @@ class Config:
             object.__setattr__(self, "actor_starts", self.learning_starts)
         for name in ("start", "freeze"):
             if not isinstance(getattr(self, name), str):
-                raise UserError(f"{name} must be a text, not {getattr(self, name)!r}")
+                raise UserError(f"{name} must be a string, not {getattr(self, name)!r}")
         for part in self.frozen:
             if part.split(".")[0] not in ("actor", "critics"):
                 raise UserError(
-                    f"freeze: {part!r} is not actor or critics, or a layer of one, such as "
+                    f"freeze: {part!r} is not actor, critics, or a layer of these, such as "
                     "actor.memory"
                 )
         window = 1 + self.window_tokens
         if capacity < max(self.batch_size, window):
             raise UserError(
                 f"replay_capacity ({capacity}) holds less than a batch "
-                f"({self.batch_size}) or a window ({window}); raise it"
+                f"({self.batch_size}) or a window ({window}); raise replay_capacity"
             )
 
     def _resolve_history_length(self) -> None:
@@ -238,14 +249,14 @@ class Config:
             object.__setattr__(self, "history_length", DEFAULT_HISTORY_LENGTH)
 
     def _resolve_replay(self) -> None:
-        """Fill in how a batch is cut and how the agent acts; without a history neither matters."""
+        """Set the defaults of ``replay`` and ``acting``, which have no effect without a history."""
         for name, choices in (("replay", REPLAYS), ("acting", (*ACTINGS, None))):
             value = getattr(self, name)
             if value not in choices:
                 named = [choice for choice in choices if choice]
                 raise UserError(
-                    f"{name} {value!r} is unknown{nearest(str(value), named)}; there are "
-                    f"{' and '.join(named)}"
+                    f"{name} {value!r} is unknown{nearest(str(value), named)}; choose "
+                    f"{' or '.join(named)}"
                 )
         for name in ("burn_in_gradient", "normalise_observations"):
             value = getattr(self, name)
@@ -260,8 +271,8 @@ class Config:
         if not segments:
             if self.segment_length and self.has_window:
                 raise UserError(
-                    f"segment_length={self.segment_length} needs replay='segments'; with windows "
-                    "every transition has a history of its own"
+                    f"segment_length={self.segment_length} needs replay='segments': with windows, "
+                    "every transition has its own history"
                 )
             resolved["segment_length"] = 0
         elif self.segment_length is None and isinstance(self.batch_size, int):
@@ -283,7 +294,7 @@ class Config:
                 lower = max(count, value - value % count)
                 raise UserError(
                     f"{name} ({value:,}) is not a multiple of environments ({count}), which step "
-                    f"together; {lower:,} would be"
+                    f"together; {lower:,} is one"
                 )
         rows = self.segment_steps * count if self.replay == "segments" else 0
         for name, value in (
@@ -294,7 +305,7 @@ class Config:
                 raise UserError(
                     f"{name} ({value:,}) holds less than a segment of each environment "
                     f"(segment_length {self.segment_steps} x environments {count} = {rows:,}): "
-                    "raise it, or lower one of the two"
+                    f"raise {name}, or lower segment_length or environments"
                 )
         if self.update_every % count and count % self.update_every:
             raise UserError(
@@ -308,13 +319,13 @@ class Config:
             raise UserError(f"segment_length must be at least 1, not {length}")
         if self.batch_size % length:
             raise UserError(
-                f"segment_length ({length}) does not divide batch_size ({self.batch_size}); a "
-                "batch is whole segments: choose another of the two"
+                f"segment_length ({length}) does not divide batch_size ({self.batch_size}): a "
+                "batch consists of whole segments; change one of them"
             )
         if length > self.capacity:
             raise UserError(
-                f"segment_length ({length}) is longer than the replay ({self.capacity}); lower it, "
-                "or raise replay_capacity"
+                f"segment_length ({length}) is longer than the replay ({self.capacity}); lower "
+                "segment_length, or raise replay_capacity"
             )
 
     def _checked(self, field: dataclasses.Field) -> Any:
@@ -343,13 +354,13 @@ class Config:
 
     @property
     def window_tokens(self) -> int:
-        """Past tokens in a window: l, and 0 for an agent without one."""
+        """Past tokens in a window: l, or 0 for an agent without a window."""
         assert self.history_length is not None  # resolved when it was made
         return self.history_length
 
     @property
     def runs_on(self) -> bool:
-        """Whether the agent acts with a carry that runs on from the episode's start."""
+        """Whether the agent acts with a carry that it updates from the start of the episode."""
         return self.acting == "carry"
 
     @property
@@ -360,27 +371,27 @@ class Config:
 
     @property
     def frozen(self) -> tuple[str, ...]:
-        """Parts of the networks whose weights stay as they began."""
+        """Parts of the networks whose weights are not trained."""
         return tuple(part.strip() for part in self.freeze.split(",") if part.strip())
 
     @property
     def updates_per_round(self) -> int:
-        """Critic updates at once, after each `steps_per_round` steps of all environments."""
+        """Critic updates after each `steps_per_round` steps of all environments."""
         return max(1, self.environments // self.update_every)
 
     @property
     def steps_per_round(self) -> int:
-        """Steps of all environments between updates."""
+        """Steps of all environments between two rounds of updates."""
         return max(1, self.update_every // self.environments)
 
     @property
     def first_learning_step(self) -> int:
-        """The step of all environments from which on there are updates."""
+        """The first step of all environments after which an update is made."""
         return -(-self.learning_starts // self.environments)
 
     @property
     def updates(self) -> int:
-        """Critic updates until the end."""
+        """Critic updates in the whole training."""
         steps = max(0, self.total_steps // self.environments - self.first_learning_step)
         return -(-steps // self.steps_per_round) * self.updates_per_round
 
@@ -407,7 +418,7 @@ def traced_fields() -> tuple[str, ...]:
 
 
 def _as_number(value: Any, integral: bool) -> int | float | None:
-    """``value`` as a plain Python number; None when it is not one (booleans and NaN are not)."""
+    """``value`` as a plain Python number; None for anything else, for booleans and for NaN."""
     if isinstance(value, bool):
         return None
     try:

@@ -1,4 +1,4 @@
-"""The one kind of error that is meant for the user's eyes."""
+"""The error for mistakes that the user can correct."""
 
 import difflib
 from collections.abc import Iterable
@@ -15,5 +15,5 @@ def nearest(word: str, choices: Iterable[str]) -> str:
 
 
 def first_line(error: BaseException) -> str:
-    """The first line of a foreign error's message, or its type where it has none."""
+    """The first line of an error's message, or the error's type if the message is empty."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0]

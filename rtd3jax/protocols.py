@@ -1,7 +1,7 @@
-"""What the package asks of an environment and of a policy, whoever wrote it.
+"""The methods that the package needs of an environment and of a policy.
 
-Their states and parameters are pytrees of their own, of which the package knows nothing: where they
-pass through, their type is ``object``.
+An environment and a policy choose the types of their states and parameters: any pytree. Where the
+package only passes such a pytree on, its type is ``object``.
 """
 
 from typing import Any, Protocol
@@ -10,11 +10,11 @@ import jax
 
 
 class EnvironmentLike(Protocol):
-    """A gymnax >= 1.0 environment; `rtd3jax.envs.entry.check_gymnax` says what lacks."""
+    """A gymnax >= 1.0 environment; `rtd3jax.envs.entry.check_gymnax` names what is missing."""
 
     @property
     def default_params(self) -> Any:
-        """Parameters for where none are given; numbers in them may be traced."""
+        """Parameters that are used when the caller gives none; their numbers may be traced."""
 
     def reset(self, key: jax.Array, params: Any = None, /) -> tuple[Any, Any]:
         """The first observation [O] of an episode, and the state."""
@@ -29,7 +29,7 @@ class EnvironmentLike(Protocol):
 
 
 class ComposableEnvironment(EnvironmentLike, Protocol):
-    """What a disturbance is composed with: the parts of gymnax's ``Environment``."""
+    """An environment that can be disturbed: it has the methods of gymnax's ``Environment``."""
 
     @property
     def name(self) -> str:
@@ -58,12 +58,12 @@ class ComposableEnvironment(EnvironmentLike, Protocol):
 
 
 class PolicyLike(Protocol):
-    """What `rtd3jax.evaluate` plays; a pytree, so that it can be an argument of compiled code."""
+    """A policy for `rtd3jax.evaluate`; a pytree, so that it can be an argument of compiled code."""
 
     def init(self, key: jax.Array | None = None, /) -> Any:
-        """The state before an episode's first step; a random policy starts its stream by ``key``.
+        """The state before an episode's first step.
 
-        ``key`` None gives a fixed stream.
+        A random policy draws its numbers from ``key``; None stands for a fixed key.
         """
 
     def step(self, state: Any, observation: jax.Array, /) -> tuple[Any, Any]:

@@ -1,4 +1,4 @@
-"""Names that users may add to: agents, memories and learners, each in one table."""
+"""Tables of names to which users may add: agents, memories and learners."""
 
 from collections.abc import Iterator
 from typing import Any, Generic, TypeVar
@@ -9,11 +9,11 @@ Entry = TypeVar("Entry")
 
 
 class Registry(Generic[Entry]):
-    """Entries by name, in the order in which they came.
+    """Entries by name, in the order of their registration.
 
     Args:
-        kind: what an entry is called in messages, such as ``memory``.
-        remedy: the call that adds one, for messages.
+        kind: what messages call an entry, such as ``memory``.
+        remedy: the call that adds an entry, for messages.
     """
 
     def __init__(self, kind: str, remedy: str) -> None:
@@ -25,13 +25,16 @@ class Registry(Generic[Entry]):
         """Add ``entry`` under ``name``.
 
         Raises:
-            UserError: when the name is taken and ``replace`` is false, or is not a word.
+            UserError: when ``name`` is not a word, or is taken while ``replace`` is false.
         """
         if not isinstance(name, str) or not name or any(c.isspace() or c in "/:," for c in name):
-            raise UserError(f"{self._kind} {name!r} is no name: use letters, digits and hyphens")
+            raise UserError(
+                f"{self._kind} {name!r} is not a valid name: use letters, digits and hyphens"
+            )
         if name in self._entries and not replace:
             raise UserError(
-                f"{self._kind} {name!r} is there already; choose another name, or say replace=True"
+                f"{self._kind} {name!r} is already registered; choose another name, "
+                "or pass replace=True"
             )
         self._entries[name] = entry
 
@@ -58,10 +61,10 @@ class Registry(Generic[Entry]):
 
 
 AGENTS: Registry[Any] = Registry("algorithm", "rtd.register_agent(name, variant)")
-"""Filled by `rtd3jax.agents.variants`."""
+"""`rtd3jax.agents.variants` fills it."""
 
 MEMORIES: Registry[Any] = Registry("memory", "rtd.register_memory(name, module)")
-"""Filled by `rtd3jax.agents.memory`."""
+"""`rtd3jax.agents.memory` fills it."""
 
 LEARNERS: Registry[Any] = Registry("learner", "rtd.register_learner(name, make)")
-"""Filled by `rtd3jax.agents.learners`."""
+"""`rtd3jax.agents.learners` fills it."""

@@ -11,7 +11,7 @@ from rtd3jax import sweep
 from rtd3jax.agents.variants import ALGORITHMS
 from rtd3jax.config import Config
 from rtd3jax.envs import registry
-from rtd3jax.study import finish, pace, presets, recorder, references
+from rtd3jax.study import finish, presets, recorder, references, time_estimate
 from rtd3jax.study.plan import Cell, Grid, make_cells
 from rtd3jax.study.presets import PRESETS
 from rtd3jax.study.results import CURVES, EPISODES, read_table
@@ -105,7 +105,7 @@ def test_a_lost_lane_is_reported_and_the_exit_status_says_so(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("", "say what to run"),
+        ("", "choose what to run"),
         ("--env rovr", "rover"),
         ("--env rover --disturbances ar1-slipp", "ar1-slip"),
         ("--env rover --algorithms h-td", "did you mean 'h-td3'"),
@@ -114,7 +114,7 @@ def test_a_lost_lane_is_reported_and_the_exit_status_says_so(tmp_path, capsys):
         ("--preset quick --total-steps -1", "total_steps must be at least 1"),
         ("--preset quick --batch-size 5000", "batch_size"),
         ("--env pendulum --disturbances noise:sigma=-1", "sigma"),
-        ("--preset quick --device gpu", "--device gpu: there is none here"),
+        ("--preset quick --device gpu", "--device gpu: this machine has none"),
         ("--preset quick --hidden-size 200000", "one lane needs"),
         ("--preset quick --history-lengths 0", "history_length must be at least 1"),
         ("--preset rover --env pendulum", "has settings for rover"),
@@ -135,9 +135,9 @@ def test_a_directory_that_is_no_study_is_left_alone(tmp_path, capsys):
 
 def test_dry_run_prints_the_plan(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(
-        pace, "group_seconds", lambda jobs: 60.0 * (1 + jobs[0].program.window_tokens)
+        time_estimate, "group_seconds", lambda jobs: 60.0 * (1 + jobs[0].program.window_tokens)
     )
-    monkeypatch.setattr(pace, "workers", lambda: [None, None])
+    monkeypatch.setattr(time_estimate, "workers", lambda: [None, None])
     assert sweep.main(["--preset", "rover", "--dry-run", "--out", str(tmp_path / "run")]) == 0
     plan, said = capsys.readouterr()
     assert "18 cells × 5 seeds = 90 lanes" in plan and "programs to compile: 6" in plan

@@ -1,1 +1,1 @@
-"""The commands: a module for each, which `python -m rtd3jax.NAME` runs."""
+"""The commands: ``python -m rtd3jax.NAME`` runs the module of this name."""

@@ -1,4 +1,4 @@
-"""What the commands have in common: how bad input ends them, and how modules of a user are."""
+"""Code that the commands share: the exit status for bad input, and common options."""
 
 import argparse
 import io
@@ -10,29 +10,36 @@ from rtd3jax.errors import UserError
 
 
 def show_what_can_be_shown() -> None:
-    """Let a terminal that lacks a letter show "?" in its place: output must not end a training."""
+    """Print "?" for a letter that the terminal cannot show, so that no run ends by an error."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
 
 
 def exit_status(work: Callable[[], int], place: Callable[[], Any]) -> int:
-    """What ``work`` returns; 2, and one line for people, where the input or a file is at fault.
+    """Run a command and return its exit status.
 
-    ``place`` names the directory that a failing file operation most likely meant.
+    Args:
+        work: the command; it returns the status.
+        place: returns the path that an error message names when a file operation failed and the
+            system named no file.
+
+    Returns:
+        what ``work`` returns; 2, after one line on stderr, if the input or a file is at fault.
     """
     try:
         return work()
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
     except OSError as error:
-        # A full disk, say. What was written before is whole, and the same command goes on from it.
+        # A full disk, for example. Files that were written before it are complete, and the same
+        # command continues from them.
         print(f"error: {error.filename or place()}: {error.strerror or error}", file=sys.stderr)
     return 2
 
 
 def add_import(group: argparse._ActionsContainer) -> None:
-    """Give a parser, or a group of one, the option whose values go to `import_modules`."""
+    """Add ``--import`` to a parser or a group; `import_modules` takes its values."""
     group.add_argument(
         "--import",
         dest="imports",
@@ -46,7 +53,7 @@ def add_import(group: argparse._ActionsContainer) -> None:
 def run_parser(
     name: str, description: str | None, example: str, what: str = "a run directory"
 ) -> argparse.ArgumentParser:
-    """The parser of a command on a run directory, with ``run`` and ``--import``."""
+    """The parser of a command that reads a run directory: it has ``run`` and ``--import``."""
     show_what_can_be_shown()
     parser = argparse.ArgumentParser(
         prog=f"python -m rtd3jax.{name}",

@@ -1,7 +1,7 @@
-"""``python -m rtd3jax.compare RUN_A RUN_B ...``: what runs reached in the cells they share.
+"""``python -m rtd3jax.compare RUN_A RUN_B ...``: compare returns of runs in their common cells.
 
-The first run is what the others are compared with: differences are paired where seeds are equal.
-Prints a Markdown table; with --out DIR also writes DIR/compare.parquet and DIR/compare.md.
+The first run is the baseline. Differences are paired if both runs have the same seeds. The command
+prints a Markdown table; with --out DIR it also writes DIR/compare.parquet and DIR/compare.md.
 """
 
 import argparse
@@ -15,7 +15,7 @@ from rtd3jax.system.files import user_path, write_bytes_atomically
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; the exit status: 0 done, 2 bad input."""
+    """Run the command and return its exit status. 0: done. 2: bad input."""
     options = _parser().parse_args(arguments)
     return exit_status(lambda: _run(options), lambda: options.out or options.runs[0])
 
@@ -31,7 +31,7 @@ def _run(options: argparse.Namespace) -> int:
     if options.out is not None:
         out = user_path(options.out)
         if out.exists() and not out.is_dir():
-            raise UserError(f"{out} is a file: --out names a directory")
+            raise UserError(f"{out} is a file: --out must name a directory")
         write_bytes_atomically(out / "compare.parquet", table.to_parquet(index=False))
         write_bytes_atomically(out / "compare.md", text.encode())
         print(f"\nresults: {out / 'compare.parquet'}, {out / 'compare.md'}")
@@ -39,7 +39,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _short_names(paths: list[str]) -> list[str]:
-    """The last parts of the paths: as few as tell them apart."""
+    """The last parts of each path: the fewest that make all names different."""
     parts = [path.replace("\\", "/").split("/") for path in paths]
     for count in range(1, max(map(len, parts)) + 1):
         names = ["/".join(part[-count:]) for part in parts]
@@ -59,10 +59,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "runs", nargs="+", metavar="RUN", help="run directories, the baseline first"
     )
-    parser.add_argument("--out", metavar="DIR", help="write the table there too")
+    parser.add_argument("--out", metavar="DIR", help="also write the table to this directory")
     parser.add_argument(
         "--true-return",
         action="store_true",
-        help="compare returns of the undisturbed state, not those of the reward as given",
+        help="compare returns computed from the undisturbed state, not from the reward that the "
+        "agent received",
     )
     return parser

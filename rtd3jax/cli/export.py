@@ -1,4 +1,4 @@
-"""``python -m rtd3jax.export``: write a trained policy in a form that leaves the lab."""
+"""``python -m rtd3jax.export``: write a trained policy as a file for another runtime."""
 
 import argparse
 from collections.abc import Sequence
@@ -12,11 +12,11 @@ from rtd3jax.system.files import user_path
 from rtd3jax.system.imports import import_modules
 
 POLICY = "policy"
-"""The form that `rtd3jax.load_policy` reads."""
+"""The format that `rtd3jax.load_policy` reads."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; the exit status: 0 done, 2 bad input."""
+    """Run the command and return its exit status. 0: done. 2: bad input."""
     options = _parser().parse_args(arguments)
     return exit_status(lambda: _run(options), lambda: options.run)
 
@@ -48,7 +48,7 @@ def _default_name(policy: Policy, options: argparse.Namespace) -> str:
     suffix = ".safetensors" if options.format == POLICY else FORMATS[options.format][0]
     if user_path(options.run).is_dir():
         stem = f"{policy.algorithm}_l{int(policy.history_length)}_seed-{options.seed or 0}"
-        # A module's name must be an identifier to be imported by name.
+        # Python imports a module by name only if the name is an identifier.
         return (stem.replace("-", "_") if suffix == ".py" else stem) + suffix
     return str(user_path(options.run).with_suffix(suffix))
 
@@ -58,14 +58,18 @@ def _parser() -> argparse.ArgumentParser:
     what = "a run directory, or a file that policy.save wrote"
     parser = run_parser("export", __doc__, example, what)
     parser.add_argument(
-        "--format", required=True, choices=(*FORMATS, POLICY), help="the form of the file"
+        "--format", required=True, choices=(*FORMATS, POLICY), help="the format of the file"
     )
     which = parser.add_argument_group("which lane of the run directory")
-    which.add_argument("--agent", help=f"the agent: {', '.join(AGENTS)}, or your own")
+    which.add_argument("--agent", help=f"the agent: {', '.join(AGENTS)}, or a registered one")
     which.add_argument("--seed", type=int, help="the seed [0]")
-    which.add_argument("--env", help="where its lanes differ: the environment")
-    which.add_argument("--disturbance", help="the disturbance, as it was given to the sweep")
+    which.add_argument("--env", help="the environment, if the lanes have several")
+    which.add_argument("--disturbance", help="the disturbance, as in the command of the sweep")
     which.add_argument("--history-length", type=int, metavar="L", help="past steps in a window")
-    parser.add_argument("--out", metavar="FILE", help="the file [AGENT_lL_seed-N.SUFFIX, here]")
+    parser.add_argument(
+        "--out",
+        metavar="FILE",
+        help="the file to write [AGENT_lL_seed-N.SUFFIX in the working directory]",
+    )
     parser.add_argument("--force", action="store_true", help="replace the file if it exists")
     return parser

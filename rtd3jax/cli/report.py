@@ -1,6 +1,7 @@
-"""``python -m rtd3jax.report RUN``: the page of a run directory, one HTML file without a network.
+"""``python -m rtd3jax.report RUN``: write the page of a run, an HTML file that needs no network.
 
-A sweep writes it too; this command writes it again, from another version or for an older run.
+A sweep writes this page when it ends. This command writes the page again, for example for a run of
+an earlier version.
 """
 
 import argparse
@@ -14,7 +15,7 @@ from rtd3jax.system.imports import import_modules
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; the exit status: 0 done, 2 bad input."""
+    """Run the command and return its exit status. 0: done. 2: bad input."""
     options = _parser().parse_args(arguments)
     return exit_status(lambda: _run(options), lambda: options.run)
 
@@ -30,8 +31,11 @@ def _run(options: argparse.Namespace) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = run_parser("report", __doc__, "runs/quick")
-    parser.add_argument("--out", metavar="FILE", help=f"the page [RUN/{NAME}]")
+    parser.add_argument("--out", metavar="FILE", help=f"the file to write [RUN/{NAME}]")
     parser.add_argument(
-        "--no-playback", dest="playback", action="store_false", help="no episodes in the page"
+        "--no-playback",
+        dest="playback",
+        action="store_false",
+        help="leave the episodes out of the page",
     )
     return parser

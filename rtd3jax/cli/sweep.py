@@ -1,7 +1,8 @@
-"""``python -m rtd3jax.sweep``: train every cell of a study, and write down what came out.
+"""``python -m rtd3jax.sweep``: train every cell of a study, and write its results.
 
-A cell is an algorithm under a disturbance with a history length; its seeds are trained side by
-side. The same command again trains what is missing; with more seeds, cells or steps, those too.
+A cell is an algorithm under a disturbance with a history length. A lane is the training of one seed
+of a cell. If you repeat the command, it trains the lanes that are missing; with more seeds, cells
+or steps, it also trains those.
 """
 
 import argparse
@@ -37,10 +38,10 @@ from rtd3jax.training.run import check_strategy
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; the exit status.
+    """Run the command and return its exit status.
 
-    0 done, 1 lanes were lost or failed, 2 bad input, 130 interrupted, 143 asked to terminate (as a
-    batch system does before it kills).
+    0: done. 1: lanes were lost or failed. 2: bad input. 130: interrupted. 143: terminated by
+    SIGTERM, which a batch system sends before SIGKILL.
     """
     try:
         options = sweep_options.parser(__doc__).parse_args(arguments)
@@ -64,7 +65,7 @@ def _start(options: argparse.Namespace, arguments: Sequence[str] | None) -> int:
 
 
 class _Terminated(KeyboardInterrupt):
-    """SIGTERM: lanes write their checkpoints, as after Ctrl-C."""
+    """Raised at SIGTERM, so that lanes write their checkpoints as they do after Ctrl-C."""
 
 
 def _terminate(*_: object) -> None:
@@ -72,7 +73,7 @@ def _terminate(*_: object) -> None:
 
 
 def _on_termination(handler: Any) -> Any:
-    """Set SIGTERM's handler; the one before. Only the main thread may."""
+    """Set the handler of SIGTERM and return the previous one; only the main thread can do so."""
     if threading.current_thread() is not threading.main_thread():
         return None
     return signal.signal(signal.SIGTERM, handler)
@@ -87,26 +88,30 @@ def _run(options: argparse.Namespace) -> int:
     strategy = check_strategy(options.strategy)
     check_loggers(options.log)
     if sum(map(bool, (options.shard, options.distributed, options.cluster))) > 1:
-        raise UserError("--shard, --distributed and --cluster each share out the lanes: choose one")
+        raise UserError(
+            "--shard, --distributed and --cluster each divide the lanes among processes: "
+            "choose one of them"
+        )
     out = sweep_options.out(options)
     directory = RunDirectory(out, cells, seeds, episodes, prepare=False)
-    news = "" if options.fresh else directory.plan()
+    additions = "" if options.fresh else directory.plan()
     jobs = directory.jobs(strategy)
     if options.dry_run:
         say = functools.partial(print, file=sys.stderr, flush=True)
         print(plan_text(directory.cells, directory.seeds, jobs, strategy, usable_memory(), say))
-        print(news, end="\n" if news else "")
+        print(additions, end="\n" if additions else "")
         return 0
-    # On a cluster its nodes, not this machine, must have the memory.
-    fit = len(jobs) if options.cluster else None
-    at_once = fit or lanes_at_once(jobs, strategy, len(workers()), usable_memory())
+    if options.cluster:  # the nodes of the cluster need the memory, not this machine
+        at_once = len(jobs)
+    else:
+        at_once = lanes_at_once(jobs, strategy, len(workers()), usable_memory())
     interval = sweep_options.parse_interval(options.checkpoint_every)
     shard = _shard(options)
-    add_starts(directory, jobs, write=False)  # before anything is written
+    add_starts(directory, jobs, write=False)  # raises UserError before any file is written
     if options.fresh:
         _set_aside(out)
-    if news := directory.prepare():
-        print(news)
+    if additions := directory.prepare():
+        print(additions)
     work = Work(
         strategy,
         at_once,
@@ -116,7 +121,7 @@ def _run(options: argparse.Namespace) -> int:
         keep=options.keep_checkpoints,
     )
     with writer(directory.path, shard):
-        if directory.refresh():  # another process was quicker
+        if directory.refresh():  # another process has changed the study in the meantime
             jobs = directory.jobs(strategy)
         return _train(directory, _share(jobs, shard, options), work, options)
 
@@ -130,7 +135,7 @@ def _shard(options: argparse.Namespace) -> tuple[int, int] | None:
 def _share(
     jobs: list[Job], shard: tuple[int, int] | None, options: argparse.Namespace
 ) -> list[Job]:
-    """A shard's lanes: every n-th, so that the shares cost about the same."""
+    """The lanes of a shard: every n-th, so that all shards take about the same time."""
     if options.distributed:
         return own_share(jobs)
     return jobs if shard is None else jobs[shard[0] - 1 :: shard[1]]
@@ -155,7 +160,7 @@ def _train(
     print((directory.path / "summary.md").read_text("utf-8"))
     print(f"results: {directory.path}")
     if interrupted:
-        print("interrupted: the same command goes on with the lanes that are missing")
+        print("interrupted: repeat the command to train the lanes that are missing")
         return interrupted
     for line in complaints:
         print(line, file=sys.stderr)
@@ -163,7 +168,7 @@ def _train(
 
 
 def _set_aside(out: Path) -> None:
-    """Move a run directory away: what was trained is kept under another name."""
+    """Rename a run directory, so that its lanes are kept."""
     if not (out / "config.json").exists():
         return
     with writer(out, None):
@@ -171,7 +176,7 @@ def _set_aside(out: Path) -> None:
             aside = out.with_name(f"{out.name}.old-{number}")
             if not aside.exists():
                 out.rename(aside)
-                print(f"what was there is now {aside}")
+                print(f"the previous run directory is now {aside}")
                 return
 
 

@@ -1,4 +1,4 @@
-"""The sweep's options: what may be said on the command line, and what it means."""
+"""The options of the sweep's command line, and their values as the study needs them."""
 
 import argparse
 import dataclasses
@@ -25,7 +25,7 @@ _GRID_FIELDS = ("algorithm", "history_length")
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        raise UserError(f"{message}; --help lists what there is")
+        raise UserError(f"{message}; --help lists the options")
 
 
 def parser(description: str | None) -> argparse.ArgumentParser:
@@ -37,71 +37,92 @@ def parser(description: str | None) -> argparse.ArgumentParser:
         description=description,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog=f"disturbances:\n{environments}\n  parameters may follow: noise:sigma=1.0\n"
-        "  + joins several: ar1-slip+dropout:p=0.2\n"
+        "  + combines several: ar1-slip+dropout:p=0.2\n"
         "  / separates alternatives, of which each episode draws one: noise/random-sine\n\n"
         "example:\n  python -m rtd3jax.sweep --env pendulum --algorithms td3 lstm-td3-1ha1hc \\\n"
         "      --disturbances random-sine noise --history-lengths 1 10 --seeds 5 --out runs/mine",
     )
     study = found.add_argument_group("the study")
     study.add_argument(
-        "--preset", choices=sorted(PRESETS), help="a prepared study, with its settings"
+        "--preset", choices=sorted(PRESETS), help="a study with its settings, ready to run"
     )
     study.add_argument(
         "--env", help=f"{', '.join(ENVIRONMENTS)}, a registered id, or any id that gymnax makes"
     )
     add_import(study)
-    study.add_argument("--disturbances", nargs="+", metavar="ID", help="what is hidden [none]")
+    study.add_argument(
+        "--disturbances",
+        nargs="+",
+        metavar="ID",
+        help="disturbances that the agent cannot observe [none]",
+    )
     study.add_argument("--algorithms", nargs="+", metavar="ID", help=f"{', '.join(AGENTS)}")
     study.add_argument(
         "--history-lengths", nargs="+", type=int, metavar="L", help="past steps in a window [10]"
     )
-    study.add_argument("--seeds", type=int, default=5, help="lanes of a cell, seeds 0, 1, ... [5]")
+    study.add_argument(
+        "--seeds", type=int, default=5, help="number of seeds of each cell: 0, 1, ... [5]"
+    )
     study.add_argument(
         "--final-episodes", type=int, default=20, help="episodes of the final evaluation [20]"
     )
     work = found.add_argument_group("the work")
     work.add_argument("--out", metavar="DIR", help="run directory [runs/PRESET or runs/ENV]")
-    work.add_argument("--status", action="store_true", help="what is done in --out, lane by lane")
+    work.add_argument("--status", action="store_true", help="print the state of each lane in --out")
     work.add_argument(
-        "--fresh", action="store_true", help="start over; what was there is kept as DIR.old-N"
+        "--fresh",
+        action="store_true",
+        help="start a new study; rename an existing DIR to DIR.old-N",
     )
     work.add_argument(
         "--distributed",
         action="store_true",
-        help="one of several processes of a job (SLURM, Open MPI, or JAX_COORDINATOR_ADDRESS, "
-        "JAX_NUM_PROCESSES, JAX_PROCESS_ID): trains its devices' lanes",
+        help="this process is one of a job (SLURM, Open MPI, or JAX_COORDINATOR_ADDRESS, "
+        "JAX_NUM_PROCESSES, JAX_PROCESS_ID) and trains the lanes of its own devices",
     )
     work.add_argument(
-        "--cluster", metavar="ADDRESS", help="cells as tasks of a Ray cluster: auto, or host:port"
+        "--cluster",
+        metavar="ADDRESS",
+        help="train cells as tasks of a Ray cluster: auto, or host:port",
     )
-    work.add_argument("--shard", metavar="I/N", help="this process takes the I-th of N shares")
+    work.add_argument("--shard", metavar="I/N", help="train the I-th of N shares of the lanes")
     work.add_argument(
         "--checkpoint-every",
         default="auto",
         metavar="T",
-        help="300s, 5m, 1h or 2000steps [five minutes, or longer where it would cost above 2%%]",
+        help="time or steps between checkpoints: 300s, 5m, 1h or 2000steps [five minutes, or "
+        "longer if checkpoints would take more than 2%% of the time]",
     )
     work.add_argument(
         "--keep-checkpoints",
         action="store_true",
-        help="a lane's last checkpoint stays when it ends: more --total-steps later go on from it",
+        help="keep the last checkpoint of a lane that has ended, so that a later sweep with more "
+        "--total-steps continues from it",
     )
-    work.add_argument("--dry-run", action="store_true", help="print the plan and its cost")
+    work.add_argument(
+        "--dry-run",
+        action="store_true",
+        help="print the plan with its memory and time, and train nothing",
+    )
     work.add_argument(
         "--log",
         nargs="+",
         default=[],
         choices=sorted(LOGGERS),
         metavar="TRACKER",
-        help=f"learning curves also to {', '.join(sorted(LOGGERS))}",
+        help=f"also send learning curves to {', '.join(sorted(LOGGERS))}",
     )
     work.add_argument(
         "--no-report", dest="report", action="store_false", help="do not write report.html"
     )
-    work.add_argument("--quiet", action="store_true", help="no progress bar")
-    work.add_argument("--device", choices=("cpu", "gpu", "tpu"), help="where to run [the best]")
+    work.add_argument("--quiet", action="store_true", help="print no progress bar")
     work.add_argument(
-        "--strategy", choices=("map", "vmap"), help="lanes one by one or side by side"
+        "--device", choices=("cpu", "gpu", "tpu"), help="the kind of device [JAX's default]"
+    )
+    work.add_argument(
+        "--strategy",
+        choices=("map", "vmap"),
+        help="map: train lanes one after the other; vmap: in one batched program",
     )
     config = found.add_argument_group("the configuration of every cell")
     for field in dataclasses.fields(Config):
@@ -124,9 +145,9 @@ def _type_name(field: dataclasses.Field) -> str:
 
 
 def grids(options: argparse.Namespace) -> list[Grid]:
-    """The preset's grids with the lists that were given in place of theirs."""
+    """The grids of the preset, in which lists from the command line replace the preset's lists."""
     if options.preset is None and options.env is None:
-        raise UserError("say what to run: --preset quick, or --env with --algorithms")
+        raise UserError("choose what to run: --preset quick, or --env with --algorithms")
     if options.preset is None:
         found = [Grid(options.env, ("none",), ALGORITHMS)]
     else:
@@ -135,7 +156,7 @@ def grids(options: argparse.Namespace) -> list[Grid]:
         if options.env is not None and environments != [options.env]:
             raise UserError(
                 f"--preset {options.preset} has settings for {' and '.join(environments)}; "
-                f"leave out --env {options.env}, or the preset"
+                f"leave out --env {options.env}, or --preset"
             )
     given = {
         "disturbances": options.disturbances and tuple(options.disturbances),
@@ -147,7 +168,7 @@ def grids(options: argparse.Namespace) -> list[Grid]:
 
 
 def overrides(options: argparse.Namespace) -> dict[str, Any]:
-    """Fields of the configuration that were given."""
+    """The fields of the configuration that the command line sets."""
     names = (f.name for f in dataclasses.fields(Config) if f.name not in _GRID_FIELDS)
     return {n: getattr(options, n) for n in names if getattr(options, n) is not None}
 
@@ -155,12 +176,12 @@ def overrides(options: argparse.Namespace) -> dict[str, Any]:
 def out(options: argparse.Namespace) -> Path:
     """The run directory."""
     if not (options.out or options.preset or options.env):
-        raise UserError("say where: --out DIR")
+        raise UserError("name the run directory: --out DIR")
     return user_path(options.out or Path("runs") / (options.preset or options.env))
 
 
 def count(name: str, value: int, most: int = 100_000) -> int:
-    """``value``, if it is from 1 to ``most``."""
+    """``value``; raises UserError unless it is from 1 to ``most``."""
     if not 1 <= value <= most:
         raise UserError(f"{name} must be from 1 to {most:,}, not {value}")
     return value
@@ -172,7 +193,7 @@ def device(platform: str) -> Any:
         return jax.local_devices(backend=platform)[0]
     except RuntimeError as error:
         raise UserError(
-            f"--device {platform}: there is none here, or JAX was installed without it "
+            f"--device {platform}: this machine has none, or JAX was installed without its support "
             "(pip install 'rtd3jax[cuda13]' for NVIDIA GPUs)"
         ) from error
 

@@ -1,7 +1,8 @@
-"""``python -m rtd3jax.transfer RUN``: test trained agents under other disturbances than their own.
+"""``python -m rtd3jax.transfer RUN``: test trained agents under other disturbances.
 
-Writes RUN/transfer.parquet (a row per policy, disturbance and episode), draws it into the page of
-the run, and prints the mean return of each agent. Repeating the command replaces the table.
+Writes RUN/transfer.parquet (a row per policy, disturbance and episode), adds the table to the page
+of the run, and prints the mean return of each agent. If you repeat the command, it replaces the
+table.
 """
 
 import argparse
@@ -15,7 +16,7 @@ from rtd3jax.system.imports import import_modules
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; the exit status: 0 done, 2 bad input."""
+    """Run the command and return its exit status. 0: done. 2: bad input."""
     options = _parser().parse_args(arguments)
     return exit_status(lambda: _run(options), lambda: options.run)
 
@@ -36,9 +37,12 @@ def _run(options: argparse.Namespace) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = run_parser("transfer", __doc__, "runs/rover --on ar1-slip ar1-slip-fast")
     parser.add_argument(
-        "--on", nargs="+", metavar="ID", help="disturbances to test on [all those of the run]"
+        "--on",
+        nargs="+",
+        metavar="ID",
+        help="disturbances to test on [all disturbances of the run]",
     )
     parser.add_argument(
-        "--episodes", type=int, default=100, help="of each policy and disturbance [100]"
+        "--episodes", type=int, default=100, help="episodes of each policy and disturbance [100]"
     )
     return parser

@@ -294,7 +294,7 @@ def disturb(
     assert isinstance(params, DisturbedParams)
     params = params.replace(**{channel: sequence(getattr(params, channel), process)})
     disturbed = Disturbed(base, reward_from, params)
-    check_fit(disturbed)
+    check_processes(disturbed)
     return disturbed
 
 
@@ -331,7 +331,7 @@ def _left(process: Process, elements: list[int]) -> list[int]:
     return elements
 
 
-def check_fit(env: Disturbed) -> None:
+def check_processes(env: Disturbed) -> None:
     """Raise UserError if a process of the default parameters does not fit its channel."""
     params = env.default_params
     env.observation_space(params)

@@ -12,14 +12,14 @@ from typing import Any, cast
 
 import gymnax
 
-from rtd3jax.envs.about import About, Drawing
 from rtd3jax.envs.compat.from_gymnasium import PREFIX, from_gymnasium
 from rtd3jax.envs.compat.gymnax import make_gymnax
+from rtd3jax.envs.description import Description, Drawing
 from rtd3jax.envs.disturbed import (
     CHANNELS,
     Disturbed,
     DisturbedParams,
-    check_fit,
+    check_processes,
     disturb,
     sequence,
 )
@@ -66,7 +66,7 @@ class _Entry:
         positive: parameters of the environment that must be greater than zero.
         reward_from_observation: disturbances under which the reward is the observation's.
         with_params: makes the environment with other default parameters.
-        about: baselines, ceiling and drawing.
+        description: baselines, ceiling and drawing.
     """
 
     env: EnvironmentLike | None
@@ -76,7 +76,7 @@ class _Entry:
     positive: tuple[str, ...] = ()
     reward_from_observation: tuple[str, ...] = ()
     with_params: Callable[[Any], Any] | None = None
-    about: About = About()
+    description: Description = Description()
 
 
 _NONE: dict[str, tuple[str, Process]] = {"none": ("observation", NoDisturbance())}
@@ -143,7 +143,8 @@ def register(
         reward_from_observation: names of disturbances under which the reward is computed from the
             observation that the agent saw, by the environment's ``observed_reward``, unless
             ``reward_from`` is given to ``make``.
-        baselines: policies that need no training, by name: see `rtd3jax.envs.about.About`.
+        baselines: policies that need no training, by name; see
+            `rtd3jax.envs.description.Description`.
         ceiling: the best possible return, for `rtd3jax.ceiling` and a study: see there.
         drawing: how the page of a study shows an episode.
         with_params: makes the environment with other default parameters, such as its class. Where
@@ -162,10 +163,10 @@ def register(
     if isinstance(env, type) or not (is_environment or callable(env)):
         raise UserError(f"{env_id!r} must be an environment or a function, not {env!r}")
     _check_free(env_id, module, replace)
-    about = About(dict(baselines or {}), ceiling, drawing)
-    extras = (tuple(positive), tuple(reward_from_observation), with_params, about)
+    description = Description(dict(baselines or {}), ceiling, drawing)
+    extras = (tuple(positive), tuple(reward_from_observation), with_params, description)
     if not is_environment:
-        if disturbances is not None or extras != ((), (), None, About()):
+        if disturbances is not None or extras != ((), (), None, Description()):
             raise UserError(
                 f"{env_id!r}: disturbances and what else is known of an environment are for an "
                 "environment, not for a function"
@@ -176,22 +177,24 @@ def register(
     env = cast("EnvironmentLike", env)
     named = _named_processes(env_id, env, disturbances or {}, try_disturbances)
     _check_extras(env_id, env, named, extras)
-    known = next((e.about for e in _entries.values() if e.env is not None and e.env == env), None)
+    known = next(
+        (e.description for e in _entries.values() if e.env is not None and e.env == env), None
+    )
     if known is not None:
-        extras = (*extras[:3], about.or_else(known))
+        extras = (*extras[:3], description.or_else(known))
     _entries[env_id] = _Entry(env, None, named, module, *extras)
 
 
-def about_of(env: EnvironmentLike, env_id: str | None = None) -> About:
+def description_of(env: EnvironmentLike, env_id: str | None = None) -> Description:
     """What was registered with ``env_id``; without it, with an environment that equals ``env``.
 
     ``env`` may be disturbed. What nobody registered has neither baselines, ceiling nor drawing.
     """
     if env_id in _entries:
-        return _entries[env_id].about
+        return _entries[env_id].description
     base = env.base if isinstance(env, Disturbed) else env
-    known = (e.about for e in _entries.values() if e.env is not None and e.env == base)
-    return next(known, About())
+    known = (e.description for e in _entries.values() if e.env is not None and e.env == base)
+    return next(known, Description())
 
 
 def disturbances_of(env_id: str) -> tuple[str, ...]:
@@ -219,18 +222,20 @@ def _check_extras(
     env_id: str,
     env: EnvironmentLike,
     named: Mapping[str, tuple[str, Process]],
-    extras: tuple[tuple[str, ...], tuple[str, ...], Callable[[Any], Any] | None, About],
+    extras: tuple[tuple[str, ...], tuple[str, ...], Callable[[Any], Any] | None, Description],
 ) -> None:
     """Raise UserError, naming the argument of `register`, for what the environment has not."""
-    positive, reward_from_observation, with_params, about = extras
+    positive, reward_from_observation, with_params, description = extras
     params = own_parameters(env)
     fields = list(_settable(params))
     wanted = positive
-    if about.drawing is not None:
-        if not isinstance(about.drawing, Drawing):
-            raise UserError(f"{env_id!r}: drawing must be an rtd.Drawing, not {about.drawing!r}")
-        seconds = about.drawing.step_seconds
-        wanted += (*about.drawing.constants, *([] if seconds is None else [seconds]))
+    if description.drawing is not None:
+        if not isinstance(description.drawing, Drawing):
+            raise UserError(
+                f"{env_id!r}: drawing must be an rtd.Drawing, not {description.drawing!r}"
+            )
+        seconds = description.drawing.step_seconds
+        wanted += (*description.drawing.constants, *([] if seconds is None else [seconds]))
     for name in wanted:
         if name not in fields:
             raise UserError(f"{env_id!r} has no parameter {name!r}{nearest(name, fields)}")
@@ -239,13 +244,13 @@ def _check_extras(
             raise UserError(f"{env_id!r} has no disturbance {name!r}{nearest(name, named)}")
         if not hasattr(env, "observed_reward"):
             raise UserError(f"{env_id!r}: a reward from the observation needs observed_reward")
-    functions: dict[str, Any] = {"ceiling": about.ceiling, "with_params": with_params}
+    functions: dict[str, Any] = {"ceiling": description.ceiling, "with_params": with_params}
     functions = {name: value for name, value in functions.items() if value is not None}
-    functions |= {f"baseline {name!r}": value for name, value in about.baselines.items()}
+    functions |= {f"baseline {name!r}": value for name, value in description.baselines.items()}
     for name, value in functions.items():
         if not callable(value):
             raise UserError(f"{env_id!r}: {name} must be a function, not {value!r}")
-    for name in about.baselines:
+    for name in description.baselines:
         if not re.fullmatch(r"[\w.-]+", name) or name in NO_BASELINES:
             raise UserError(
                 f"{env_id!r}: a baseline cannot be called {name!r}; choose another name of "
@@ -362,7 +367,7 @@ def _disturbed(env_id: str, entry: _Entry, disturbance: str, parameters: dict[st
             return base
     acting = {channel: on(channel) for channel in CHANNELS}
     env = Disturbed(base, reward_from, DisturbedParams(env=params, **acting))
-    check_fit(env)
+    check_processes(env)
     return env
 
 

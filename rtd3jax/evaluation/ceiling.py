@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from rtd3jax.envs.about import Ceiling
+from rtd3jax.envs.description import Ceiling
 from rtd3jax.envs.interface import environment_name
-from rtd3jax.envs.registry import about_of
+from rtd3jax.envs.registry import description_of
 from rtd3jax.errors import UserError, first_line
 from rtd3jax.evaluation.rollout import evaluate
 from rtd3jax.protocols import EnvironmentLike
@@ -26,7 +26,7 @@ def ceiling(
     Raises:
         UserError: for an environment whose ceiling is not known.
     """
-    best_return = about_of(env, env_id).ceiling
+    best_return = description_of(env, env_id).ceiling
     name = environment_name(env)
     if best_return is None:
         raise UserError(f"no ceiling of {name} is known: rtd.register(..., ceiling=...) tells one")

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rtd3jax.envs.about import Drawing
+from rtd3jax.envs.description import Drawing
 from rtd3jax.envs.disturbed import Disturbed, seen_elements
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import (
@@ -19,9 +19,9 @@ from rtd3jax.envs.interface import (
     environment_name,
     foreign_code,
 )
-from rtd3jax.envs.registry import about_of
+from rtd3jax.envs.registry import description_of
 from rtd3jax.errors import UserError
-from rtd3jax.policies.fit import check_fit
+from rtd3jax.policies.compatibility import check_compatible
 from rtd3jax.protocols import EnvironmentLike, PolicyLike
 from rtd3jax.system.program_cache import make_room
 
@@ -146,7 +146,7 @@ def rollout(
     for name, value, low in (("episodes", episodes, 1), ("seed", seed, 0), ("steps", steps, 1)):
         if isinstance(value, bool) or value != int(value) or not low <= value < 2**32:
             raise UserError(f"{name} must be an integer of at least {low}, not {value!r}")
-    drawing = about_of(env).drawing or Drawing()
+    drawing = description_of(env).drawing or Drawing()
     played = play_episodes(
         policy, env, int(episodes), int(seed), min(int(steps), limit), drawing.hidden, params=params
     )
@@ -174,7 +174,9 @@ def play_episodes(
     """
     params = parameters_of(env, params)
     own = describe(env, params)
-    check_fit(policy, own.observation_size, own.action_shape, own.action_low, own.action_high)
+    check_compatible(
+        policy, own.observation_size, own.action_shape, own.action_low, own.action_high
+    )
     make_room()
     frames = _play(policy, env, params, jax.random.key(seed), episodes, steps, hidden)
     return {name: np.asarray(value) for name, value in frames.items()}

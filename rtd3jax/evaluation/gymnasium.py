@@ -9,7 +9,7 @@ from jax.typing import ArrayLike
 
 from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT
 from rtd3jax.errors import UserError
-from rtd3jax.policies.fit import check_fit
+from rtd3jax.policies.compatibility import check_compatible
 from rtd3jax.policies.trained import Policy
 from rtd3jax.protocols import PolicyLike
 
@@ -51,7 +51,7 @@ def run_in_gymnasium(
 
 
 def _play(policy: PolicyLike, env: gymnasium.Env, episodes: int, seed: int) -> np.ndarray:
-    space = _check_fit(policy, env)
+    space = _check_spaces(policy, env)
     returns = np.zeros(episodes)
     # As seeds of their own: neighbouring seeds shall not share episodes.
     for index, episode_seed in enumerate(np.random.SeedSequence(seed).generate_state(episodes)):
@@ -83,7 +83,7 @@ def _act(policy: PolicyLike, state: object, observation: jax.Array) -> tuple[jax
     return policy.step(state, observation)
 
 
-def _check_fit(policy: PolicyLike, env: gymnasium.Env) -> gymnasium.spaces.Box:
+def _check_spaces(policy: PolicyLike, env: gymnasium.Env) -> gymnasium.spaces.Box:
     """The space of actions; UserError where policy and environment do not fit each other."""
     if not isinstance(env, gymnasium.Env):
         raise UserError(
@@ -98,7 +98,7 @@ def _check_fit(policy: PolicyLike, env: gymnasium.Env) -> gymnasium.spaces.Box:
             f"the environment's observations are {observations}; a policy needs a flat Box: "
             "wrap it in gymnasium.wrappers.FlattenObservation"
         )
-    check_fit(policy, observations.shape[0], actions.shape, actions.low, actions.high)
+    check_compatible(policy, observations.shape[0], actions.shape, actions.low, actions.high)
     kind = type(policy).__name__
     seen = jax.ShapeDtypeStruct(observations.shape, np.float32)
     try:

@@ -9,7 +9,7 @@ from rtd3jax.envs.compat.from_gymnasium import release
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT, describe, foreign_code
 from rtd3jax.errors import UserError
-from rtd3jax.policies.fit import check_fit
+from rtd3jax.policies.compatibility import check_compatible
 from rtd3jax.protocols import EnvironmentLike, PolicyLike
 from rtd3jax.system.program_cache import make_room
 
@@ -52,7 +52,7 @@ def both_returns(
             raise UserError(f"{name} must be an integer of at least {low}, not {value!r}")
     params = parameters_of(env, params)
     interface = describe(env, params)
-    check_fit(
+    check_compatible(
         policy,
         interface.observation_size,
         interface.action_shape,

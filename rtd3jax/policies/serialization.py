@@ -36,22 +36,22 @@ def read_policy(path: str | os.PathLike) -> Policy:
         UserError: when the file is missing, damaged, something else, of a newer format, or does not
             hold the arrays that its header announces.
     """
-    arrays, about = read_arrays(path)
-    if isinstance(about, dict) and "cell" in about and "seed" in about:
+    arrays, metadata = read_arrays(path)
+    if isinstance(metadata, dict) and "cell" in metadata and "seed" in metadata:
         raise UserError(
             f"{path} is a lane of a run directory and no saved policy: load it with "
-            f"load_policy({str(Path(path).parents[2])!r}, algorithm=..., seed={about['seed']})"
+            f"load_policy({str(Path(path).parents[2])!r}, algorithm=..., seed={metadata['seed']})"
         )
-    if not isinstance(about, dict) or about.get("kind") != KIND:
+    if not isinstance(metadata, dict) or metadata.get("kind") != KIND:
         raise UserError(f"{path} is not a saved policy")
-    if about.get("format") not in _FORMATS:
+    if metadata.get("format") not in _FORMATS:
         raise UserError(
-            f"{path} has format {about.get('format')}, and this version of rtd3jax reads up to "
+            f"{path} has format {metadata.get('format')}, and this version of rtd3jax reads up to "
             f"{NORMALISED_FORMAT}: use the version that wrote it, or a newer one"
         )
-    interface, facts = _header(path, about)
+    interface, facts = _header(path, metadata)
     normaliser = below(arrays, "normaliser")
-    if (about["format"] == NORMALISED_FORMAT) != bool(normaliser):
+    if (metadata["format"] == NORMALISED_FORMAT) != bool(normaliser):
         raise UserError(f"{path} is damaged: its arrays do not go with its format")
     actor = {name: array for name, array in arrays.items() if not name.startswith("normaliser.")}
     return restore_policy(path, actor, interface, normaliser=normaliser, **facts)
@@ -173,10 +173,10 @@ def _in_half_ranges(
     return actor
 
 
-def _header(path: str | os.PathLike, about: dict[str, Any]) -> tuple[Interface, dict[str, Any]]:
+def _header(path: str | os.PathLike, metadata: dict[str, Any]) -> tuple[Interface, dict[str, Any]]:
     """What a file's header says, checked: the interface, and `restore_policy`'s other facts."""
     wrong = f"{path} is damaged: its header's"
-    algorithm, memory = about.get("algorithm"), about.get("memory", "lstm")
+    algorithm, memory = metadata.get("algorithm"), metadata.get("memory", "lstm")
     if not isinstance(algorithm, str) or algorithm not in AGENTS:
         raise UserError(
             f"{path}: the agent {algorithm!r} is not known here, only {', '.join(AGENTS)}; "
@@ -187,51 +187,51 @@ def _header(path: str | os.PathLike, about: dict[str, Any]) -> tuple[Interface, 
             f"{path}: the memory {memory!r} is not known here, only {', '.join(MEMORIES)}; "
             "register yours with rtd.register_memory before you load it"
         )
-    acting = about.get("acting", "window")
+    acting = metadata.get("acting", "window")
     if acting not in ACTINGS:
         raise UserError(f"{wrong} acting is {acting!r}, not {' or '.join(ACTINGS)}")
     windowed = AGENTS[algorithm].has_window
     lowest = {"hidden_size": 1, "history_length": windowed}
     for name, least in lowest.items():
-        if not _is_count(about.get(name), int(least)):
-            raise UserError(f"{wrong} {name} is {about.get(name)!r}")
-    interface = read_interface(path, about)
+        if not _is_count(metadata.get(name), int(least)):
+            raise UserError(f"{wrong} {name} is {metadata.get(name)!r}")
+    interface = read_interface(path, metadata)
     size = interface.action_size
-    centre_token = np.asarray(about.get("centre_token", np.zeros(size)), np.float32)
+    centre_token = np.asarray(metadata.get("centre_token", np.zeros(size)), np.float32)
     if centre_token.shape != (size,) or not np.all(np.isfinite(centre_token)):
         raise UserError(f"{wrong} centre_token is not {size} numbers")
     return interface, {
-        "format": about["format"],
+        "format": metadata["format"],
         "centre_token": centre_token,
         "algorithm": algorithm,
         "memory": memory,
         "acting": acting,
-        "history_length": about["history_length"],
-        "width": about["hidden_size"],
+        "history_length": metadata["history_length"],
+        "width": metadata["hidden_size"],
     }
 
 
-def read_interface(path: str | os.PathLike, about: Mapping[str, Any]) -> Interface:
+def read_interface(path: str | os.PathLike, metadata: Mapping[str, Any]) -> Interface:
     """Sizes and bounds in a file's header, checked.
 
     Raises:
         UserError: when they are not such.
     """
     wrong = f"{path} is damaged: its header's"
-    if not _is_count(about.get("observation_size"), 1):
-        raise UserError(f"{wrong} observation_size is {about.get('observation_size')!r}")
-    shape = about.get("action_shape")
+    if not _is_count(metadata.get("observation_size"), 1):
+        raise UserError(f"{wrong} observation_size is {metadata.get('observation_size')!r}")
+    shape = metadata.get("action_shape")
     if not isinstance(shape, list) or not all(_is_count(n, 1) for n in shape):
         raise UserError(f"{wrong} action_shape is {shape!r}")
     size = math.prod(shape)
     try:
-        low, high = (np.asarray(about[f"action_{e}"], np.float32) for e in ("low", "high"))
+        low, high = (np.asarray(metadata[f"action_{e}"], np.float32) for e in ("low", "high"))
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"{wrong} action bounds are not numbers") from error
     fit = low.shape == high.shape == (size,) and np.all(np.isfinite([low, high]))
     if not fit or not np.all(low < high):
         raise UserError(f"{wrong} action bounds are not {size} pairs of low < high")
-    return Interface(about["observation_size"], tuple(shape), size, low, high)
+    return Interface(metadata["observation_size"], tuple(shape), size, low, high)
 
 
 def _is_count(value: object, low: int) -> bool:

@@ -191,7 +191,7 @@ class Policy:
                 weights are not finite; for a batch of policies.
         """
         check_target(path, overwrite)
-        write_new(path, array_bytes(self._arrays(), self._about()), overwrite)
+        write_new(path, array_bytes(self._arrays(), self._metadata()), overwrite)
 
     def export(self, path: str | os.PathLike, format: str, overwrite: bool = False) -> None:
         """Write the policy in a form that runs without rtd3jax.
@@ -224,7 +224,7 @@ class Policy:
                 self.centre_token,
                 self.normaliser,
             ),
-            about=self._about(),
+            metadata=self._metadata(),
             cell=cell,
             network=self.network,
             params=actor,
@@ -271,7 +271,7 @@ class Policy:
             return NORMALISED_FORMAT
         return CARRY_FORMAT if self.acting == "carry" else FORMAT
 
-    def _about(self) -> dict[str, Any]:
+    def _metadata(self) -> dict[str, Any]:
         """The header of a file that holds the policy."""
         return {
             "kind": KIND,

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rtd3jax.envs.about import Ceiling
+from rtd3jax.envs.description import Ceiling
 from rtd3jax.errors import UserError, first_line
 from rtd3jax.evaluation.ceiling import ceiling
 from rtd3jax.study.plan import Cell

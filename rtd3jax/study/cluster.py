@@ -25,8 +25,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from rtd3jax.errors import UserError, first_line
 from rtd3jax.study.derive import Reference
-from rtd3jax.study.early import EarlyAnswers
 from rtd3jax.study.execute import Work, train_here, waiting_jobs
+from rtd3jax.study.interim import InterimResults
 from rtd3jax.study.lane_files import cell_name
 from rtd3jax.study.log import LOG, lane_of, parse_log, steps_reached
 from rtd3jax.study.loggers import Logger
@@ -104,9 +104,9 @@ def train_on_cluster(
             index = directory.cells.index(cell)
             arguments = (path, index, seeds, dataclasses.replace(work, quiet=True), need.cpus)
             pending[task.options(**options).remote(*arguments, list(imports))] = members
-        early = EarlyAnswers(directory, references, page=work.page)
+        interim = InterimResults(directory, references, page=work.page)
         log = _Log(directory, logger)
-        _watch(ray, directory, pending, complaints, early, log, work.quiet)
+        _watch(ray, directory, pending, complaints, interim, log, work.quiet)
 
 
 def _alive(ray: ModuleType) -> list[dict]:
@@ -269,7 +269,7 @@ def _watch(
     directory: RunDirectory,
     pending: dict[Any, list[Job]],
     complaints: list[str],
-    early: EarlyAnswers,
+    interim: InterimResults,
     log: "_Log",
     quiet: bool,
 ) -> None:
@@ -287,7 +287,7 @@ def _watch(
                 words = f"{cells - len(pending)} of {cells} cells"
                 bar.update(line, completed=log.steps(), cells=words)
                 if done:
-                    early.refresh()
+                    interim.refresh()
     except KeyboardInterrupt:
         for task in pending:
             ray.cancel(task, force=False)

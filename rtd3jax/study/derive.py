@@ -87,8 +87,8 @@ def _read_lane(
     path = lanes.lane_path(cell, seed)
     row = {**cell.key, "seed": seed}
     try:
-        arrays, about = read_arrays(path)
-        failure = about["failure"]
+        arrays, metadata = read_arrays(path)
+        failure = metadata["failure"]
         points = zip(*(arrays[f"results.{n}"] for n in _CURVE_ARRAYS), strict=True)
         finals = zip(*(arrays[f"results.{n}"] for n in _FINAL_ARRAYS), strict=True)
         curves += [

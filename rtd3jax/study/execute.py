@@ -7,7 +7,7 @@ from typing import Any
 import jax
 
 from rtd3jax.study.derive import Reference
-from rtd3jax.study.early import EarlyAnswers
+from rtd3jax.study.interim import InterimResults
 from rtd3jax.study.loggers import Logger
 from rtd3jax.study.plan import label
 from rtd3jax.study.recorder import Recorder
@@ -62,8 +62,8 @@ def train_here(
     devices = workers()[: work.workers]
     checkpoints = checkpoints_of(directory, work.interval)
     groups = make_groups(waiting, work.strategy, len(devices), work.at_once, checkpoints)
-    early = None if references is None else EarlyAnswers(directory, references, page=work.page)
-    recorder = Recorder(directory, checkpoints, early, logger, complaints, keep=work.keep)
+    interim = None if references is None else InterimResults(directory, references, page=work.page)
+    recorder = Recorder(directory, checkpoints, interim, logger, complaints, keep=work.keep)
     with Progress(groups, label, enabled=not work.quiet) as bar:
 
         def on_chunk(group: Group) -> None:

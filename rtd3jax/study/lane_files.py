@@ -15,7 +15,7 @@ from rtd3jax.errors import UserError
 from rtd3jax.policies.serialization import below, read_interface, restore_policy
 from rtd3jax.policies.trained import FORMAT, Policy
 from rtd3jax.study.plan import Cell
-from rtd3jax.system.files import read_about, read_arrays, write_arrays, write_bytes_atomically
+from rtd3jax.system.files import read_arrays, read_metadata, write_arrays, write_bytes_atomically
 
 
 class LaneFiles:
@@ -57,8 +57,8 @@ class LaneFiles:
         if not path.exists():
             return False
         try:
-            about = read_about(path)
-            return about["cell"]["total_steps"] == cell.config.total_steps or self.is_lost(
+            metadata = read_metadata(path)
+            return metadata["cell"]["total_steps"] == cell.config.total_steps or self.is_lost(
                 cell, seed
             )
         except (UserError, KeyError, TypeError):
@@ -66,7 +66,7 @@ class LaneFiles:
 
     def is_lost(self, cell: Cell, seed: int) -> bool:
         """Whether the lane, which has a file, was lost in training."""
-        return read_about(self.lane_path(cell, seed))["failure"] is not None
+        return read_metadata(self.lane_path(cell, seed))["failure"] is not None
 
     def write_lane(
         self,
@@ -94,10 +94,10 @@ class LaneFiles:
         arrays = dict(parameters)
         arrays |= {f"results.{name}": np.asarray(value) for name, value in curves.items()}
         arrays |= {f"metrics.{name}": np.asarray(value) for name, value in metrics.items()}
-        about = {"format": FORMAT, "cell": cell.to_dict(), "seed": seed, "failure": failure}
+        metadata = {"format": FORMAT, "cell": cell.to_dict(), "seed": seed, "failure": failure}
         if interface is not None:
-            about["interface"] = interface
-        write_arrays(self.lane_path(cell, seed), arrays, about)
+            metadata["interface"] = interface
+        write_arrays(self.lane_path(cell, seed), arrays, metadata)
 
     def policy(self, cell: Cell, seed: int) -> Policy:
         """The trained policy of a lane.
@@ -112,11 +112,11 @@ class LaneFiles:
                 f"{lane} is not trained yet in {self.path}; --status tells how far it is"
             )
         path = self.lane_path(cell, seed)
-        arrays, about = read_arrays(path)
-        if about["failure"] is not None:
-            raise UserError(f"{lane} was lost in training: {about['failure']['reason']}")
-        if isinstance(about.get("interface"), dict):
-            interface = read_interface(path, about["interface"])
+        arrays, metadata = read_arrays(path)
+        if metadata["failure"] is not None:
+            raise UserError(f"{lane} was lost in training: {metadata['failure']['reason']}")
+        if isinstance(metadata.get("interface"), dict):
+            interface = read_interface(path, metadata["interface"])
         else:  # of a version that did not write it
             env = cell.make_env()
             interface = describe(env, env.default_params)
@@ -130,7 +130,7 @@ class LaneFiles:
             width=cell.config.hidden_size,
             memory=cell.config.memory,
             acting="carry" if cell.config.runs_on else "window",
-            format=about.get("format", 1),
+            format=metadata.get("format", 1),
         )
 
     def start_path(self, cell: Cell, seed: int) -> Path:

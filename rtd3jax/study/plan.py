@@ -13,7 +13,7 @@ from rtd3jax.envs.registry import make, parse_disturbance
 from rtd3jax.errors import UserError
 from rtd3jax.registries import AGENTS
 from rtd3jax.study.memory_plan import job_bytes, lanes_at_once
-from rtd3jax.study.pace import study_seconds
+from rtd3jax.study.time_estimate import study_seconds
 from rtd3jax.training.lanes import Job, workers
 from rtd3jax.training.run import make_jobs
 
@@ -138,7 +138,7 @@ class Cost:
         programs: to compile.
         state_bytes: of the largest lane's state.
         working_bytes: that the largest lane needs besides while it advances.
-        seconds: of computing, without compiling; see `rtd3jax.study.pace`.
+        seconds: of computing, without compiling; see `rtd3jax.study.time_estimate`.
     """
 
     programs: int

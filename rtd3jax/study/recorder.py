@@ -6,7 +6,7 @@ import time
 import numpy as np
 
 from rtd3jax.evaluation.rollout import both_returns
-from rtd3jax.study.early import EarlyAnswers
+from rtd3jax.study.interim import InterimResults
 from rtd3jax.study.log import LOG, repair_log
 from rtd3jax.study.loggers import Logger
 from rtd3jax.study.plan import label
@@ -24,19 +24,19 @@ class Recorder:
         self,
         directory: RunDirectory,
         checkpoints: Checkpoints,
-        early: EarlyAnswers | None,
+        interim: InterimResults | None,
         logger: Logger | None,
         complaints: list[str],
         *,
         keep: bool = False,
     ):
-        """Without ``early``, tables and page are left to whoever started this process.
+        """Without ``interim``, tables and page are left to whoever started this process.
 
         With ``keep``, a lane's last checkpoint stays when it ends.
         """
         self._directory = directory
         self._checkpoints = checkpoints
-        self._early = early
+        self._interim = interim
         self._logger = logger
         self._logged: dict[int, int] = {}
         self._there = repair_log(directory.path / LOG)
@@ -64,8 +64,8 @@ class Recorder:
                 if not stays:
                     self._checkpoints.discard(job)
             group.state = None  # its replay is no longer needed
-            if self._early is not None:
-                self._early.refresh()
+            if self._interim is not None:
+                self._interim.refresh()
 
     def _log(self, group: Group) -> None:
         assert group.returns is not None and group.metrics is not None

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from rtd3jax.envs.compat.from_gymnasium import is_simulated
-from rtd3jax.envs.registry import about_of
+from rtd3jax.envs.registry import description_of
 from rtd3jax.errors import UserError, first_line
 from rtd3jax.evaluation.rollout import both_returns
 from rtd3jax.policies.baselines import constant_policy, random_policy
@@ -33,7 +33,7 @@ def references_on(cell: Cell) -> list[Reference]:
     """
     env = cell.make_env()
     policies: dict[str, Any] = {"random": random_policy(env)}
-    for name, make_policy in about_of(env, cell.env).baselines.items():
+    for name, make_policy in description_of(env, cell.env).baselines.items():
         if name in AGENTS:
             raise UserError(f"the baseline {name!r} of {cell.env} has the name of an agent")
         try:

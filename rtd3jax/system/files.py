@@ -1,4 +1,4 @@
-"""Files that are whole or absent: written beside their place, flushed, and moved there."""
+"""Atomic files: each is written under a temporary name, flushed, and then renamed."""
 
 import hashlib
 import json
@@ -18,7 +18,7 @@ _ENTRY = "rtd3jax"
 
 
 def user_path(path: str | os.PathLike) -> Path:
-    """``path`` with ``~`` and ``~name`` expanded: a shell does not do so after ``--out=``.
+    """``path`` with ``~`` and ``~name`` expanded; a shell does not expand them after ``--out=``.
 
     Raises:
         UserError: when there is no such home directory.
@@ -33,7 +33,7 @@ def write_bytes_atomically(path: str | os.PathLike, data: bytes) -> None:
     """Put ``data`` at ``path``; a crash at any moment leaves either the old file or the new one."""
     path = user_path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    # Opened as any file is, so that the umask and the directory's rules say who may read it.
+    # Not `tempfile`: the umask and the directory's rules must decide who may read the file.
     name = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
     handle = os.open(name, flags, 0o666)
@@ -49,10 +49,10 @@ def write_bytes_atomically(path: str | os.PathLike, data: bytes) -> None:
 
 
 def check_target(path: str | os.PathLike, overwrite: bool = False) -> Path:
-    """``path``, if a file may be put there.
+    """``path``, if a file may be written there.
 
     Raises:
-        UserError: when it is a directory, or exists and is not to be replaced.
+        UserError: when ``path`` is a directory, or exists and ``overwrite`` is false.
     """
     path = user_path(path)
     try:
@@ -67,7 +67,7 @@ def check_target(path: str | os.PathLike, overwrite: bool = False) -> Path:
 
 
 def write_new(path: str | os.PathLike, data: bytes, overwrite: bool = False) -> None:
-    """Put ``data`` where the user wants it; nothing is replaced unasked.
+    """Write ``data`` to ``path``; an existing file is replaced only with ``overwrite``.
 
     Raises:
         UserError: as `check_target` does, or when the file cannot be written.
@@ -81,47 +81,49 @@ def write_new(path: str | os.PathLike, data: bytes, overwrite: bool = False) -> 
         ) from error
 
 
-def write_arrays(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], about: object) -> None:
-    """Write arrays as safetensors, with ``about`` (anything JSON) and a digest of the whole."""
-    write_bytes_atomically(path, array_bytes(arrays, about))
+def write_arrays(
+    path: str | os.PathLike, arrays: Mapping[str, np.ndarray], metadata: object
+) -> None:
+    """Write arrays as safetensors, with ``metadata`` (any JSON value) and a digest of both."""
+    write_bytes_atomically(path, array_bytes(arrays, metadata))
 
 
-def array_bytes(arrays: Mapping[str, np.ndarray], about: object) -> bytes:
+def array_bytes(arrays: Mapping[str, np.ndarray], metadata: object) -> bytes:
     """The content of the file that `write_arrays` writes."""
     arrays = {name: np.asarray(array, order="C") for name, array in arrays.items()}
-    # One entry of metadata, because several would be written in no fixed order.
-    entry = json.dumps({"about": about, "sha256": _digest(arrays, about)})
+    # One entry of metadata: safetensors writes several entries in no fixed order.
+    entry = json.dumps({"about": metadata, "sha256": _digest(arrays, metadata)})
     return save(arrays, {_ENTRY: entry})
 
 
 def read_arrays(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], Any]:
-    """What `write_arrays` wrote.
+    """The arrays and the metadata of a file that `write_arrays` wrote.
 
     Raises:
-        UserError: when the file is missing, truncated, altered, or something else.
+        UserError: when the file is missing, truncated, altered, or of another kind.
     """
     path = user_path(path)
     try:
-        # safetensors says "No such file" whatever the reason, and the system says the true one.
+        # safetensors reports "No such file" for any reason; `open` reports the true reason.
         path.open("rb").close()
         with safe_open(path, "numpy") as file:
             entry = json.loads((file.metadata() or {})[_ENTRY])
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        about, digest = entry["about"], entry["sha256"]
+        metadata, digest = entry["about"], entry["sha256"]
     except OSError as error:
         raise UserError(f"{path} cannot be read ({error.strerror or first_line(error)})") from error
     except (SafetensorError, KeyError, ValueError, TypeError) as error:
         raise UserError(f"{path} cannot be read ({first_line(error)})") from error
-    if digest != _digest(arrays, about):
+    if digest != _digest(arrays, metadata):
         raise UserError(f"{path} is damaged: its checksum does not agree")
-    return arrays, about
+    return arrays, metadata
 
 
-def read_about(path: str | os.PathLike) -> Any:
-    """What `write_arrays` was told about the arrays; these are not read, and nothing is checked.
+def read_metadata(path: str | os.PathLike) -> Any:
+    """The metadata of a file that `write_arrays` wrote; its arrays are neither read nor checked.
 
     Raises:
-        UserError: when the file is missing or something else.
+        UserError: when the file is missing or of another kind.
     """
     try:
         with safe_open(user_path(path), "numpy") as file:
@@ -131,7 +133,7 @@ def read_about(path: str | os.PathLike) -> Any:
 
 
 def flatten(tree: object, prefix: str = "") -> dict[str, np.ndarray]:
-    """A nested dict's arrays under dotted names."""
+    """The arrays of a nested dict under dotted names, such as ``actor.head.kernel``."""
     if not isinstance(tree, dict):
         return {prefix: np.asarray(tree)}
     flat: dict[str, np.ndarray] = {}
@@ -141,7 +143,7 @@ def flatten(tree: object, prefix: str = "") -> dict[str, np.ndarray]:
 
 
 def unflatten(flat: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """The nested dict of dotted names."""
+    """The nested dict that `flatten` took apart."""
     tree: dict[str, Any] = {}
     for name, value in flat.items():
         *parents, last = name.split(".")
@@ -152,8 +154,8 @@ def unflatten(flat: Mapping[str, np.ndarray]) -> dict[str, Any]:
     return tree
 
 
-def _digest(arrays: Mapping[str, np.ndarray], about: object) -> str:
-    digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode())
+def _digest(arrays: Mapping[str, np.ndarray], metadata: object) -> str:
+    digest = hashlib.sha256(json.dumps(metadata, sort_keys=True).encode())
     for name in sorted(arrays):
         array = arrays[name]
         digest.update(f"{name} {array.dtype} {array.shape}".encode())

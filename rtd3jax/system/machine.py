@@ -1,4 +1,4 @@
-"""What this process may use of its machine: cores, and memory under every limit that is set."""
+"""The cores and the memory that this process may use, under every limit of the machine."""
 
 import contextlib
 import os
@@ -9,7 +9,7 @@ _OWN_CGROUPS, _OWN_STATUS = Path("/proc/self/cgroup"), Path("/proc/self/statm")
 
 
 def cores() -> int:
-    """Cores that this process may run on; all of them where the system knows no affinity."""
+    """Cores that this process may run on; all cores where the system has no CPU affinity."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -35,7 +35,7 @@ def _physical() -> int | None:
 
 
 def _physical_on_windows() -> int:
-    """As `_physical`, where there is no sysconf."""
+    """As `_physical`, for Windows, which has no sysconf."""
     import ctypes
 
     class Status(ctypes.Structure):
@@ -49,11 +49,11 @@ def _physical_on_windows() -> int:
         ctypes.windll.kernel32.GlobalMemoryStatusEx(ctypes.byref(status))  # type: ignore[attr-defined]
         return int(status.total)
     except (AttributeError, OSError):
-        return 8 * 2**30  # nothing is known: what most machines have
+        return 8 * 2**30  # unknown: a usual size is assumed
 
 
 def _cgroup_limits() -> list[int]:
-    """What containers and batch systems set (cgroup v1 and v2), here and in every group above."""
+    """Limits of containers and batch systems: of this cgroup (v1 or v2) and all its parents."""
     found = []
     with contextlib.suppress(OSError, ValueError):
         for line in _OWN_CGROUPS.read_text(encoding="utf-8").splitlines():
@@ -65,7 +65,7 @@ def _cgroup_limits() -> list[int]:
             else:
                 continue
             group = root / path.strip("/")
-            # In a container the path may be the host's, which is not seen here: the root is.
+            # In a container, the path may be the host's, which is not visible; the root is.
             for directory in (group, *group.parents):
                 found += _number(directory / name)
                 if directory == root:
@@ -74,14 +74,14 @@ def _cgroup_limits() -> list[int]:
 
 
 def _number(file: Path) -> list[int]:
-    """The number in a file; none where it says "max" or is not there."""
+    """The number in a file; an empty list for the word "max" or a missing file."""
     with contextlib.suppress(OSError, ValueError):
         return [int(file.read_text(encoding="utf-8"))]
     return []
 
 
 def _address_space() -> int | None:
-    """What ``ulimit -v`` leaves, beside what this process has mapped already."""
+    """Bytes that ``ulimit -v`` leaves besides those that this process has already mapped."""
     try:
         import resource
     except ImportError:  # Windows
@@ -97,7 +97,7 @@ def _address_space() -> int | None:
 
 
 def _slurm_limits() -> list[int]:
-    """What SLURM gave the job on this machine; it may enforce that without a cgroup."""
+    """Memory that SLURM gave the job on this machine; SLURM may enforce it without a cgroup."""
 
     def megabytes(name: str) -> int | None:
         with contextlib.suppress(KeyError, ValueError):

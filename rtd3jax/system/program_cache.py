@@ -1,9 +1,10 @@
-"""Room for compiled programs: a process may map only so many pieces of memory.
+"""Removes compiled programs from memory before the process reaches its limit of memory mappings.
 
-XLA's CPU backend maps the code of every kernel by itself: a training program is some 1,700
-mappings, an evaluation a few hundred. Linux allows a process 65,530 (``vm.max_map_count``); past
-that, compiling fails and the process dies. A study has more programs than that, so programs are let
-go in time; whoever needs one again compiles it again, or reads it from JAX's persistent cache.
+XLA's CPU backend makes a memory mapping for every kernel: a training program needs about 1,700
+mappings, an evaluation a few hundred. Linux allows a process 65,530 mappings
+(``vm.max_map_count``); beyond this limit compilation fails and the process dies. A large study
+needs more, so its programs are removed in time. A program that is needed again is compiled again,
+or read from JAX's persistent cache.
 """
 
 import contextlib
@@ -16,9 +17,12 @@ import jax
 
 _MAPS, _LIMIT = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 _SHARE = 0.6
-"""Of the mappings that are allowed: what is compiled until the next look must fit in the rest."""
+"""Share of the allowed mappings at which programs are removed.
+
+Programs that are compiled before the next count must fit in the rest.
+"""
 _SECONDS = 2.0
-"""Between two looks: counting takes milliseconds, compiling one program seconds."""
+"""Seconds between two counts: a count takes milliseconds, the compilation of a program seconds."""
 
 _caches: list[Callable[[], None]] = []
 _lock = threading.Lock()
@@ -26,16 +30,19 @@ _looked = -_SECONDS
 
 
 def on_full(empty: Callable[[], None]) -> Callable[[], None]:
-    """Register what lets go of a cache of programs; a decorator."""
+    """Register a function that empties a cache of programs; a decorator."""
     _caches.append(empty)
     return empty
 
 
 def make_room() -> bool:
-    """Let all programs go if the process has most of its mappings; whether that was so.
+    """Remove all programs if the process is near its limit of mappings.
 
-    To be called where programs are about to be compiled; cheap. Programs that are running are not
-    harmed. Does nothing where there is no such limit to be read.
+    Call it before programs are compiled; it costs little. Programs that are running go on. On a
+    system without this limit nothing happens.
+
+    Returns:
+        whether the programs were removed.
     """
     global _looked
     with _lock:
@@ -52,7 +59,7 @@ def make_room() -> bool:
 
 
 def _mappings() -> tuple[int, float]:
-    """How many the process has, and how many it may have."""
+    """How many mappings the process has, and how many it may have."""
     with contextlib.suppress(OSError, ValueError):
         limit = int(_LIMIT.read_text("utf-8"))
         with _MAPS.open("rb") as lines:

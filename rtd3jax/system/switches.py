@@ -1,6 +1,7 @@
-"""JAX's own switches that do not go with this package: each is one line, and the remedy.
+"""JAX's switches with which this package cannot work: each is refused with a one-line error.
 
-Imported before anything that imports gymnax, which makes arrays on a device as it is imported.
+This module is imported before any module that imports gymnax: gymnax makes arrays on a device while
+it is imported.
 """
 
 import os
@@ -14,23 +15,23 @@ _FORBIDDING = ("disallow", "disallow_explicit")
 
 
 def check_switches() -> None:
-    """Raise UserError where a switch would end a training or an evaluation half-way."""
+    """Raise UserError if a switch would stop a training or an evaluation before its end."""
     for direction in _GUARDS:
         name = f"jax_transfer_guard{direction}"
         if getattr(jax.config, name, None) in _FORBIDDING:
             raise UserError(
-                f"{name.upper()} forbids what rtd3jax must do: its host hands programs their "
-                "numbers and reads curves and checkpoints from them; use it around code of your "
-                'own (with jax.transfer_guard("disallow"): ...), or set it to log'
+                f"{name.upper()} forbids transfers that rtd3jax needs: the host sends numbers to "
+                "the programs, and reads curves and checkpoints from them; use the guard around "
+                'your own code (with jax.transfer_guard("disallow"): ...), or set it to log'
             )
 
 
 def check_compiling() -> None:
-    """Raise UserError where nothing may be compiled: a training is one compiled program."""
+    """Raise UserError if compilation is switched off: a training is one compiled program."""
     if jax.config.values["jax_disable_jit"]:
         raise UserError(
-            "JAX_DISABLE_JIT does not go with training, which is one compiled program; to look "
-            "into an environment, step it, evaluate a policy on it or check_env it without jit"
+            "training cannot run with JAX_DISABLE_JIT: it is one compiled program; to debug an "
+            "environment without jit, step it, evaluate a policy in it, or call check_env"
         )
 
 

@@ -1,4 +1,4 @@
-"""Which versions made a file."""
+"""Versions of installed packages, which files and pages record."""
 
 import importlib.metadata
 from collections.abc import Iterable

@@ -82,7 +82,7 @@ class Checkpoints:
         began = time.monotonic()
         for job, state in jobs:
             directory = self._directory_of(job)
-            about = {
+            metadata = {
                 "format": _FORMAT,
                 "step": step,
                 "identity": self._identity_of(job),
@@ -90,7 +90,7 @@ class Checkpoints:
             }
             try:
                 directory.mkdir(parents=True, exist_ok=True)
-                write_arrays(directory / f"step-{step:09d}.safetensors", to_arrays(state), about)
+                write_arrays(directory / f"step-{step:09d}.safetensors", to_arrays(state), metadata)
             except OSError as error:
                 raise UserError(
                     f"checkpoint in {directory} cannot be written: {error.strerror}; "
@@ -138,14 +138,14 @@ class Checkpoints:
         states, complaints = {}, []
         for file in checkpoint_files(self._directory_of(job)):
             try:
-                arrays, about = read_arrays(file)
+                arrays, metadata = read_arrays(file)
             except UserError as error:
                 complaints.append(str(error))
                 continue
-            longer = self._check(file, about, job)
+            longer = self._check(file, metadata, job)
             if longer:
                 arrays = _extended(arrays, job.program, job.lane)
-            states[int(about["step"])] = from_arrays(arrays, job.program, job.lane, file)
+            states[int(metadata["step"])] = from_arrays(arrays, job.program, job.lane, file)
             if first:
                 break
         if complaints and not states:
@@ -157,14 +157,14 @@ class Checkpoints:
             warnings.warn(f"{complaint}; an older checkpoint is used", stacklevel=2)
         return states
 
-    def _check(self, file: Path, about: Any, job: Any) -> bool:
+    def _check(self, file: Path, metadata: Any, job: Any) -> bool:
         """See that a checkpoint is of this lane; whether the lane has more steps now."""
         here: dict[str, Any] = {
             "format": _FORMAT,
             "identity": self._identity_of(job),
             "versions": versions(),
         }
-        there = about if isinstance(about, dict) else {}
+        there = metadata if isinstance(metadata, dict) else {}
         longer = is_longer(there.get("identity"), here["identity"])
         if longer:
             reason = why_not_longer(there["identity"], here["identity"], int(there["step"]))

@@ -24,6 +24,7 @@ from rtd3jax.protocols import EnvironmentLike
 from rtd3jax.system.files import user_path
 from rtd3jax.system.switches import check_compiling
 from rtd3jax.training.checkpoint import Checkpoints, named_numbers
+from rtd3jax.training.feasibility import check_segments, warn_if_untrained
 from rtd3jax.training.lanes import (
     Group,
     Job,
@@ -42,7 +43,6 @@ from rtd3jax.training.loop import (
 )
 from rtd3jax.training.progress import Progress
 from rtd3jax.training.start import Start, starts_of_path
-from rtd3jax.training.worth import check_segments, warn_if_untrained
 
 _REASONS = {
     ENVIRONMENT_NOT_FINITE: "the environment gave an observation or reward that is not finite; "

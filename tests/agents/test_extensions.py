@@ -175,5 +175,5 @@ def test_agents_that_cannot_be_trained_are_one_line():
     for variant, message in cases:
         with pytest.raises(rtd.UserError, match=message):
             rtd.register_agent("mine", variant)
-    with pytest.raises(rtd.UserError, match="'td3' is there already"):
+    with pytest.raises(rtd.UserError, match="'td3' is already registered"):
         rtd.register_agent("td3", rtd.Variant(reads, critic))

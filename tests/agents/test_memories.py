@@ -154,11 +154,11 @@ def test_what_does_not_keep_to_the_interface_is_one_line(module, message):
 
 
 def test_names_are_taken_once_and_modules_are_memories():
-    with pytest.raises(rtd.UserError, match="memory 'lstm' is there already.*replace=True"):
+    with pytest.raises(rtd.UserError, match="memory 'lstm' is already registered.*replace=True"):
         rtd.register_memory("lstm", _Lag)
     with pytest.raises(rtd.UserError, match="must be a subclass of rtd.Memory"):
         rtd.register_memory("dict", dict)
-    with pytest.raises(rtd.UserError, match="is no name"):
+    with pytest.raises(rtd.UserError, match="is not a valid name"):
         rtd.register_memory("two words", _Lag)
     with pytest.raises(rtd.UserError, match="memory 'lsmt' is unknown; did you mean 'lstm'"):
         rtd.Config(memory="lsmt")

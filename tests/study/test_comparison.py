@@ -139,4 +139,4 @@ def test_a_run_without_results_and_no_run_are_one_line(runs, tmp_path, capsys):
     file = tmp_path / "file"
     file.write_text("")
     assert command.main([runs["before"], runs["after"], "--out", str(file)]) == 2
-    assert "is a file: --out names a directory" in capsys.readouterr().err
+    assert "is a file: --out must name a directory" in capsys.readouterr().err

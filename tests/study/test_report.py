@@ -12,7 +12,7 @@ from random_policies import random_policy
 
 import rtd3jax as rtd
 from rtd3jax import report, transfer
-from rtd3jax.envs.about import Ceiling
+from rtd3jax.envs.description import Ceiling
 from rtd3jax.study import ceilings
 from rtd3jax.study.derive import Reference, derive
 from rtd3jax.study.plan import Grid, make_cells

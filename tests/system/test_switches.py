@@ -72,7 +72,7 @@ def test_a_transfer_guard_is_refused_but_does_not_hinder_the_import():
     code = "import sys; from rtd3jax import sweep; sys.exit(sweep.main(['--env', 'rover']))"
     done = with_switch("JAX_TRANSFER_GUARD=disallow", code)
     assert done.returncode == 2 and done.stderr.count("\n") == 1
-    assert done.stderr.startswith("error: JAX_TRANSFER_GUARD forbids what rtd3jax must do")
+    assert done.stderr.startswith("error: JAX_TRANSFER_GUARD forbids transfers that rtd3jax needs")
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_without_jit_an_environment_can_be_looked_into_and_not_trained_on():
     env = rtd.make("rover", "ar1-slip", max_steps_in_episode=2)
     compiled = rtd.evaluate(rtd.random_policy(env), env, episodes=2)
     with jax.disable_jit():
-        with pytest.raises(rtd.UserError, match="JAX_DISABLE_JIT does not go with training"):
+        with pytest.raises(rtd.UserError, match="training cannot run with JAX_DISABLE_JIT"):
             rtd.train(env, rtd.Config("td3"), [0])
         looked_into = rtd.evaluate(rtd.random_policy(env), env, episodes=2)
     np.testing.assert_allclose(looked_into, compiled, rtol=1e-5)

@@ -9,8 +9,8 @@ from test_loop import Clock
 import rtd3jax as rtd
 from rtd3jax.agents.networks import act
 from rtd3jax.agents.replay import gather, gather_segments
+from rtd3jax.training.feasibility import updates_of
 from rtd3jax.training.loop import make_lane, make_program
-from rtd3jax.training.worth import updates_of
 
 K, STEPS, CAPACITY, LENGTH = 3, 90, 60, 3
 FIELDS = dict(

@@ -149,7 +149,7 @@ def test_each_seed_goes_on_from_its_own_and_with_others_the_same(env, kept):
         (dict(normalise_observations=False), "has normalise_observations=True"),
         (dict(freeze="actor.heart"), "actor has no layer 'heart'.*head.*its layers are"),
         (dict(freeze="body"), "'body' is not actor or critics"),
-        (dict(start=3), "start must be a text"),
+        (dict(start=3), "start must be a string"),
     ],
 )
 @pytest.mark.parametrize("of", ["policy", "checkpoints"])

@@ -5,7 +5,7 @@ disturbed case from above. `rtd3jax.envs.pendulum.filter` has a policy that boun
 below.
 """
 
-from rtd3jax.envs.about import Ceiling
+from rtd3jax.envs.description import Ceiling
 from rtd3jax.envs.disturbed import Disturbed
 from rtd3jax.envs.pendulum.value_iteration import mean_optimal_return
 from rtd3jax.envs.processes.process import NoDisturbance

@@ -1,6 +1,6 @@
 """The pendulum by name: disturbances, baseline, ceiling and drawing."""
 
-from rtd3jax.envs.about import Drawing
+from rtd3jax.envs.description import Drawing
 from rtd3jax.envs.pendulum.environment import Pendulum
 from rtd3jax.envs.pendulum.optimum import best_return
 from rtd3jax.envs.pendulum.swing_up import swing_up_policy

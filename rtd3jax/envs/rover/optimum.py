@@ -13,7 +13,7 @@ import numpy as np
 from flax import struct
 from jax.scipy.stats import norm
 
-from rtd3jax.envs.about import Ceiling
+from rtd3jax.envs.description import Ceiling
 from rtd3jax.envs.processes.process import NoDisturbance, Process
 from rtd3jax.envs.rover.environment import Rover, RoverParams
 from rtd3jax.envs.rover.slip import WHEELS, Ar1Slip, SineSlip

@@ -4,8 +4,8 @@ from typing import Any
 
 import jax
 
-from rtd3jax.envs.about import Drawing
 from rtd3jax.envs.controllers import PIDPolicy, pid_policy
+from rtd3jax.envs.description import Drawing
 from rtd3jax.envs.interface import describe
 from rtd3jax.envs.registry import register
 from rtd3jax.envs.rover.environment import Rover, RoverState

@@ -52,7 +52,7 @@ class Model:
         observation_size: O.
         action_shape: shape of the environment's action, A elements.
         arrays: of `fold`.
-        about: JSON-ready facts that travel with the file.
+        metadata: JSON-ready facts that travel with the file.
         cell: the name of its memory; None without one.
         network: the actor as a module, for the form that traces it.
         params: its parameters.
@@ -66,7 +66,7 @@ class Model:
     observation_size: int
     action_shape: tuple[int, ...]
     arrays: dict[str, np.ndarray]
-    about: dict[str, Any]
+    metadata: dict[str, Any]
     cell: str | None
     network: Network
     params: Params
@@ -98,9 +98,9 @@ class Model:
         return shapes
 
     def header(self) -> dict[str, Any]:
-        """``about`` and what a player must know: the parts of the state, which starts as zeros."""
+        """``metadata``, and the arrays of the player's state, which starts as zeros."""
         return {
-            **self.about,
+            **self.metadata,
             "memory": list(self.memory),
             "memory_has_current": self.memory_has_current,
             "current": list(self.current),

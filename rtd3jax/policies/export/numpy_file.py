@@ -14,7 +14,7 @@ def numpy_bytes(model: Model) -> bytes:
     check_portable(model, "numpy")
     shapes = {name: list(array.shape) for name, array in model.arrays.items()}
     raw = b"".join(array.astype("<f4").tobytes() for array in model.arrays.values())
-    about = repr({**model.header(), "arrays": shapes})
+    metadata = repr({**model.header(), "arrays": shapes})
     text = base64.encodebytes(raw).decode()
     source = (
         importlib.resources.files("rtd3jax.policies.export")
@@ -22,7 +22,7 @@ def numpy_bytes(model: Model) -> bytes:
         .read_text("utf-8")
     )
     assert source.count(_ABOUT) == 1 and source.count(_WEIGHTS) == 1
-    source = source.replace(_ABOUT, f"ABOUT: dict[str, Any] = {about}\n")
+    source = source.replace(_ABOUT, f"ABOUT: dict[str, Any] = {metadata}\n")
     # Last, so that no text of the header can be taken for the mark.
     head, tail = source.split(_WEIGHTS)
     return f'{head}WEIGHTS = """\n{text}"""\n{tail}'.encode()

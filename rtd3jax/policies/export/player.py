@@ -23,15 +23,15 @@ class Player:
     """The policy, with one episode's state; use one player for each plant.
 
     Args:
-        about: the policy's header; the file's own by default.
+        metadata: the policy's header; the file's own by default.
         weights: base64 of its arrays, float32 and little-endian, in the header's order.
     """
 
-    def __init__(self, about: dict[str, Any] = ABOUT, weights: str = WEIGHTS) -> None:
-        self.about = about
-        self.observation_size: int = about["observation_size"]
-        self.action_shape: tuple[int, ...] = tuple(about["action_shape"])
-        arrays = _unpack(about["arrays"], weights)
+    def __init__(self, metadata: dict[str, Any] = ABOUT, weights: str = WEIGHTS) -> None:
+        self.metadata = metadata
+        self.observation_size: int = metadata["observation_size"]
+        self.action_shape: tuple[int, ...] = tuple(metadata["action_shape"])
+        arrays = _unpack(metadata["arrays"], weights)
         self._linear = {
             name: (arrays[f"{name}_kernel"], arrays[f"{name}_bias"])
             for name in ("encoder", "current", "head", "output")
@@ -42,17 +42,17 @@ class Player:
         self._mean = arrays.get("observation_mean")
         if self._mean is not None:
             self._scale, self._limit = arrays["observation_scale"], arrays["observation_limit"]
-        self._runs_on: bool = about["acting"] == "carry"
-        self._length: int = 1 if self._runs_on else about["history_length"]
-        self._with_current: bool = about["memory_has_current"]
-        if about["memory"]:
+        self._runs_on: bool = metadata["acting"] == "carry"
+        self._length: int = 1 if self._runs_on else metadata["history_length"]
+        self._with_current: bool = metadata["memory_has_current"]
+        if metadata["memory"]:
             width = arrays["head_bias"].size
             self._advance = {"lstm": self._lstm, "gru": self._gru, "min-gru": self._min_gru}[
-                about["cell"]
+                metadata["cell"]
             ]
             # sigmoid(x) = tanh(x / 2) / 2 + 1/2: halved here, all gates are one tanh.
             gates = {"lstm": (0.5, 0.5, 0.5, 1.0), "gru": (0.5, 0.5, 1.0), "min-gru": (0.5, 1.0)}
-            half = np.repeat(np.array(gates[about["cell"]], np.float32), width)
+            half = np.repeat(np.array(gates[metadata["cell"]], np.float32), width)
             self._input = arrays["input_kernel"] * half, arrays["input_bias"] * half
             if "recurrent_kernel" in arrays:
                 self._recurrent = arrays["recurrent_kernel"] * half
@@ -68,7 +68,7 @@ class Player:
     def reset(self) -> None:
         """Forget: the next step is the first of an episode."""
         self._previous_action = np.zeros_like(self._centre)
-        if self.about["memory"]:
+        if self.metadata["memory"]:
             self._hidden[:] = 0.0
             self._cell[:] = 0.0
 
@@ -92,17 +92,17 @@ class Player:
             observation = np.minimum(np.maximum(observation, -self._limit), self._limit)
         parts = {"observation": observation, "previous_action": self._previous_action}
         features = []
-        if self.about["memory"]:
+        if self.metadata["memory"]:
             features.append(self._feed(parts) if self._with_current else self._hidden[-1].copy())
-        if self.about["current"]:
-            features.append(self._relu("current", _join(parts, self.about["current"])))
+        if self.metadata["current"]:
+            features.append(self._relu("current", _join(parts, self.metadata["current"])))
         head = self._relu("head", features[0] if len(features) == 1 else np.concatenate(features))
         kernel, bias = self._linear["output"]
         token = np.tanh(head @ kernel + bias)
         action = self._centre + self._half_range * token
         if self._centre_token is not None:
             token = token + self._centre_token
-        if self.about["memory"] and not self._with_current:
+        if self.metadata["memory"] and not self._with_current:
             self._feed({**parts, "action": token})
         self._previous_action = token
         return action.reshape(self.action_shape)
@@ -110,7 +110,7 @@ class Player:
     def _feed(self, parts: dict[str, np.ndarray]) -> np.ndarray:
         """Give all carries the step's token; the hidden state of the one that began first."""
         kernel, bias = self._input
-        token = self._relu("encoder", _join(parts, self.about["memory"])) @ kernel + bias
+        token = self._relu("encoder", _join(parts, self.metadata["memory"])) @ kernel + bias
         hidden = self._advance(token, self._hidden[: self._rows])
         self._hidden[self._first :] = hidden[: self._length]
         return hidden[-1]

@@ -155,19 +155,19 @@ class StableHlo:
     """A policy loaded from a StableHLO file; jittable, batched.
 
     Attributes:
-        about: the file's header.
+        metadata: the file's header.
     """
 
-    def __init__(self, about: dict[str, Any], exported: jax.export.Exported):
-        self.about = about
-        self.observation_size = int(about["observation_size"])
+    def __init__(self, metadata: dict[str, Any], exported: jax.export.Exported):
+        self.metadata = metadata
+        self.observation_size = int(metadata["observation_size"])
         self._call = jax.jit(exported.call)
 
     def init(self, batch: int = 1) -> State:
         """The state before the first step of ``batch`` episodes: zeros, [batch, ...]."""
         return {
             name: jnp.zeros((batch, *shape), jnp.float32)
-            for name, shape in self.about["state"].items()
+            for name, shape in self.metadata["state"].items()
         }
 
     def step(self, state: State, observation: ArrayLike) -> tuple[jax.Array, State]:
@@ -194,17 +194,17 @@ def load_stablehlo(path: str | os.PathLike) -> StableHlo:
             the package flatbuffers is missing.
     """
     _require_flatbuffers()
-    arrays, about = read_arrays(path)
-    if not isinstance(about, dict) or about.get("kind") != _KIND or "program" not in arrays:
+    arrays, metadata = read_arrays(path)
+    if not isinstance(metadata, dict) or metadata.get("kind") != _KIND or "program" not in arrays:
         raise UserError(f"{path} is not a policy in StableHLO")
-    if about.get("format") != FORMAT:
+    if metadata.get("format") != FORMAT:
         raise UserError(
-            f"{path} has format {about.get('format')}, and this version of rtd3jax reads {FORMAT}: "
-            "use the version that wrote it, or a newer one"
+            f"{path} has format {metadata.get('format')}, and this version of rtd3jax reads format "
+            f"{FORMAT}: use the version that wrote the file, or a newer version"
         )
     try:
         exported = jax.export.deserialize(bytearray(arrays["program"].tobytes()))
     except Exception as error:  # of many kinds, and all mean the same
         reason = first_line(error)
         raise UserError(f"{path} cannot be read by this version of JAX ({reason})") from error
-    return StableHlo(about, exported)
+    return StableHlo(metadata, exported)

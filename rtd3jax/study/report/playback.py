@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from rtd3jax.envs.about import Drawing
+from rtd3jax.envs.description import Drawing
 from rtd3jax.envs.disturbed import Disturbed, seen_elements
 from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT
-from rtd3jax.envs.registry import about_of
+from rtd3jax.envs.registry import description_of
 from rtd3jax.errors import UserError, first_line
 from rtd3jax.evaluation.episode import element_names, play_episodes
 from rtd3jax.protocols import EnvironmentLike, PolicyLike
@@ -83,7 +83,7 @@ def record_episodes(
 ) -> dict[str, np.ndarray]:
     """Play ``episodes`` of ``steps`` at most: arrays [episodes, steps, ...] by name.
 
-    ``hidden`` is that of the environment's `rtd3jax.envs.about.Drawing`.
+    ``hidden`` is that of the environment's `rtd3jax.envs.description.Drawing`.
 
     Episodes are those of ``evaluate(policy, env, episodes, seed)``. ``done`` says in which frame an
     episode ended; later frames mean nothing.
@@ -107,7 +107,7 @@ def _recorded(
         # One window for all lengths, so that they share a program; a policy minds its own length.
         policy = dataclasses.replace(policy, window_tokens=longest)
     limit = int(getattr(env.default_params, "max_steps_in_episode", DEFAULT_STEP_LIMIT))
-    drawing = about_of(env, cell.env).drawing or Drawing()
+    drawing = description_of(env, cell.env).drawing or Drawing()
     steps = min(limit, MOST_STEPS)
     try:
         frames = record_episodes(policy, env, count, SEED, steps, drawing.hidden)

@@ -11,7 +11,7 @@ SECONDS = 60.0
 """Between two writings of the tables and the page, at least."""
 
 
-class EarlyAnswers:
+class InterimResults:
     """Writes tables, pictures and page again while lanes are still trained."""
 
     def __init__(self, directory: RunDirectory, references: Sequence[Reference], *, page: bool):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import rtd3jax as rtd
-from rtd3jax.study import pace
+from rtd3jax.study import time_estimate
 from rtd3jax.training.run import make_jobs
 
 
@@ -22,24 +22,27 @@ def test_what_is_not_timed_lies_between_what_is(monkeypatch):
         asked.append(group[0].program.window_tokens)
         return 10.0 * group[0].program.window_tokens
 
-    monkeypatch.setattr(pace, "group_seconds", seconds)
-    monkeypatch.setattr(pace, "workers", lambda: [None] * 4)
+    monkeypatch.setattr(time_estimate, "group_seconds", seconds)
+    monkeypatch.setattr(time_estimate, "workers", lambda: [None] * 4)
     operations = lambda config: float(config.window_tokens)  # noqa: E731
-    assert pace.study_seconds(jobs, "map", operations) == pytest.approx(2 * 280 / 4)
-    assert len(asked) == pace.MOST_PROGRAMS and {1, 7} <= set(asked)
+    assert time_estimate.study_seconds(jobs, "map", operations) == pytest.approx(2 * 280 / 4)
+    assert len(asked) == time_estimate.MOST_PROGRAMS and {1, 7} <= set(asked)
     # Side by side, each of a program's lanes has a worker of its own here.
-    assert pace.study_seconds(jobs, "vmap", operations) == pytest.approx(280)
+    assert time_estimate.study_seconds(jobs, "vmap", operations) == pytest.approx(280)
 
 
 def test_a_lane_is_timed_without_its_random_steps(monkeypatch):
-    monkeypatch.setattr(pace, "_SECONDS", 0.05)
+    monkeypatch.setattr(time_estimate, "_SECONDS", 0.05)
     (job, _), told = _jobs("td3"), []
-    seconds = pace.study_seconds([job], "map", lambda config: 1.0, told.append)
+    seconds = time_estimate.study_seconds([job], "map", lambda config: 1.0, told.append)
     assert np.isfinite(seconds) and seconds > 0.0
     assert told == ["timing 1 of 1: td3 l=0"]
     (untrained, _) = _jobs("td3", total_steps=1_000, learning_starts=1_000)
-    monkeypatch.setattr(pace, "_timed", lambda *_: (1.0, 5.0))
-    with_updates, without = pace.group_seconds([job]), pace.group_seconds([untrained])
+    monkeypatch.setattr(time_estimate, "_timed", lambda *_: (1.0, 5.0))
+    with_updates, without = (
+        time_estimate.group_seconds([job]),
+        time_estimate.group_seconds([untrained]),
+    )
     assert (with_updates, without) == (800 + 2 * 5, 2 * 5)
 
 
@@ -47,6 +50,6 @@ def test_what_fails_while_it_is_timed_is_raised(monkeypatch):
     def fail(jobs, device, together):
         raise rtd.UserError("no such device")
 
-    monkeypatch.setattr(pace, "_timed", fail)
+    monkeypatch.setattr(time_estimate, "_timed", fail)
     with pytest.raises(rtd.UserError, match="no such device"):
-        pace.group_seconds(_jobs("td3"))
+        time_estimate.group_seconds(_jobs("td3"))

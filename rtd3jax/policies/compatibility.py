@@ -10,7 +10,7 @@ from rtd3jax.errors import UserError
 from rtd3jax.protocols import PolicyLike
 
 
-def check_fit(
+def check_compatible(
     policy: PolicyLike,
     observation_size: int,
     action_shape: tuple[int, ...],

@@ -52,7 +52,7 @@ class Drawing:
 
 
 @dataclasses.dataclass(frozen=True)
-class About:
+class Description:
     """Baselines, ceiling and drawing of one environment.
 
     Attributes:
@@ -69,9 +69,9 @@ class About:
     ceiling: Callable[[Any, int, int], Any] | None = None
     drawing: Drawing | None = None
 
-    def or_else(self, other: "About") -> "About":
+    def or_else(self, other: "Description") -> "Description":
         """This, with what ``other`` knows where this knows nothing."""
-        return About(
+        return Description(
             self.baselines or other.baselines,
             self.ceiling or other.ceiling,
             self.drawing or other.drawing,
