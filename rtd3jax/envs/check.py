@@ -1,4 +1,4 @@
-"""What goes wrong with environments in practice, found by playing them."""
+"""Finds common errors of an environment by playing it."""
 
 import dataclasses
 import functools
@@ -26,13 +26,13 @@ from rtd3jax.protocols import EnvironmentLike
 
 EPISODES = 8
 LONGEST_EPISODE = 1_000
-"""Steps after which an episode is no longer followed."""
+"""Steps of an episode that are played; the rest of a longer episode is not checked."""
 
 LARGEST, SMALLEST = 1e2, 1e-3
-"""Root mean squares between which a network learns from a number as it stands."""
+"""A network learns well from numbers whose root mean square lies between these bounds."""
 
 _DIGITS = 1e-5
-"""Relative error that two compilations of one program may have."""
+"""Relative difference that two compilations of one program may have."""
 
 AFTER_RESET = 8
 """Steps for which two new episodes are compared."""
@@ -40,15 +40,15 @@ AFTER_RESET = 8
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """One thing that is wrong, and what to do about it; both are one line.
+    """One problem of an environment and its remedy, each in one line.
 
     Attributes:
-        kind: ``interface`` (what every training refuses), ``dtype``, ``space``, ``vmap``,
-            ``finite``, ``pure``, ``leak``, ``final-observation``, ``time-limit``,
+        kind: ``interface`` (every training refuses the environment), ``dtype``, ``space``,
+            ``vmap``, ``finite``, ``pure``, ``leak``, ``final-observation``, ``time-limit``, or
             ``scale``.
-        problem: what was seen.
+        problem: what is wrong.
         remedy: what to do.
-        advice: whether the environment is sound and yet likely to be learned badly.
+        advice: true if the environment is correct, but training on it will probably be poor.
     """
 
     kind: str
@@ -62,19 +62,18 @@ class Finding:
 
 
 def check_env(env: EnvironmentLike, *, params: object = None, seed: int = 0) -> None:
-    """Play ``env`` with random actions, and raise if anything is wrong with it.
+    """Play ``env`` with random actions, and raise an error if it has a problem.
 
-    Eight episodes are played to their end, for at most 1,000 steps; the environment is compiled for
-    it. What is sound and yet likely to be learned badly is a warning.
+    Eight episodes are played to their end, but for at most 1,000 steps; the environment is compiled
+    for this. A finding that is only advice is given as a warning.
 
     Args:
         env: a gymnax >= 1.0 environment.
-        params: its parameters; its own by default.
-        seed: of the episodes and actions.
+        params: the environment's parameters; its default parameters by default.
+        seed: seed of the episodes and actions.
 
     Raises:
-        UserError: one that lists every `Finding` with its remedy, on lines of their own if there
-            are several.
+        UserError: listing every `Finding` with its remedy; several findings are on separate lines.
     """
     found, name = _findings(env, params, seed), environment_name(env)
     for finding in found:
@@ -96,7 +95,7 @@ def check_env(env: EnvironmentLike, *, params: object = None, seed: int = 0) -> 
 
 
 def find_problems(env: EnvironmentLike, *, params: object = None, seed: int = 0) -> list[Finding]:
-    """What `check_env` would raise, as a list; empty for a sound environment."""
+    """The findings of `check_env` as a list, which is empty for a correct environment."""
     return [finding for finding in _findings(env, params, seed) if not finding.advice]
 
 
@@ -112,7 +111,7 @@ def _findings(env: Any, params: Any, seed: int) -> list[Finding]:
         return findings
     findings += _dtypes(found)
     findings += _spaces(env, params, found)
-    if findings:  # what follows would fail on the same thing, or for it
+    if findings:  # the other checks would fail for the same reason
         return findings
     assert found.interface is not None
     with foreign_code():
@@ -120,15 +119,15 @@ def _findings(env: Any, params: Any, seed: int) -> list[Finding]:
 
 
 def _dtypes(found: Survey) -> Iterator[Finding]:
-    """Arrays that change their type between reset and step."""
+    """Finds arrays whose type changes between reset and step."""
     assert found.reset is not None and found.step is not None
     before, after = found.reset, found.step[:2]
-    remedy = "loops and automatic resets need equal ones: convert in both, e.g. jnp.float32(...)"
+    remedy = "loops and automatic resets need equal types: convert in both, e.g. jnp.float32(...)"
     pairs: Any = zip(("observation", "state"), before, after, strict=True)
     for what, one, other in pairs:
         structures: list[Any] = [jax.tree.structure(one), jax.tree.structure(other)]
         if structures[0] != structures[1]:
-            problem = f"the {what} of reset and that of step are different kinds of structure"
+            problem = f"reset and step return a {what} of different structure"
             yield Finding("dtype", problem, "return the same dataclass from both")
             continue
         leaves = jax.tree_util.tree_leaves_with_path(one)
@@ -143,18 +142,18 @@ def _dtypes(found: Survey) -> Iterator[Finding]:
 
 
 def _spaces(env: EnvironmentLike, params: object, found: Survey) -> Iterator[Finding]:
-    """Shapes that disagree with the space that the environment declares."""
+    """Finds an observation space that disagrees with the observations."""
     assert found.reset is not None
     declaring: Any = env
     try:
         space = declaring.observation_space(params)
-    except Exception:  # declaring none is allowed
+    except Exception:  # an environment need not declare a space
         return
     shape = tuple(getattr(space, "shape", None) or ())
     if shape != found.reset[0].shape:
         yield Finding(
             "space",
-            f"observation_space has shape {shape}, the observation {found.reset[0].shape}",
+            f"observation_space has shape {shape}, but the observation has {found.reset[0].shape}",
             "make observation_space(params) describe what reset and step return",
         )
 
@@ -162,7 +161,7 @@ def _spaces(env: EnvironmentLike, params: object, found: Survey) -> Iterator[Fin
 def _played(
     env: EnvironmentLike, params: object, interface: Interface, seed: int
 ) -> Iterator[Finding]:
-    """What shows only when it runs."""
+    """Finds problems that only appear when the environment is played."""
     limit = getattr(params, "max_steps_in_episode", None)
     steps = int(min(LONGEST_EPISODE, DEFAULT_STEP_LIMIT if limit is None else limit))
     try:
@@ -171,8 +170,8 @@ def _played(
         reason = (str(error).strip().splitlines() or [""])[0]
         yield Finding(
             "vmap",
-            f"it cannot be vmapped: {type(error).__name__}: {reason}",
-            "write reset and step for one lane in jax.numpy alone; "
+            f"the environment cannot be vmapped: {type(error).__name__}: {reason}",
+            "write reset and step for one environment, with only jax.numpy; "
             "a pure_callback needs a vmap_method",
         )
         return
@@ -182,20 +181,20 @@ def _played(
     yield from _final_observations(record)
     impure = list(_pure(env, params, record, seed))
     yield from impure
-    if not impure:  # what is random cannot be compared
+    if not impure:  # episodes of an impure environment cannot be compared
         yield from _leaks(env, params, record, seed)
 
 
 @dataclasses.dataclass
 class _Record:
-    """Eight first episodes E of up to T steps; numpy, but for the states.
+    """The first E = 8 episodes, of up to T steps each; numpy arrays, except for the states.
 
     Attributes:
-        first: [E, O], observations of reset.
-        seen, final: [E, T, O], the observation of step and info's ``final_observation``.
+        first: [E, O], the observations of reset.
+        seen, final: [E, T, O], the observations of step, and ``final_observation`` of info.
         reward, terminated, truncated: [E, T].
-        last_state: [E, ...], before the step that ended the episode (or the last one played).
-        last_action: [E, ...], of that step.
+        last_state: [E, ...], the state before the last step that was played of the episode.
+        last_action: [E, ...], the action of this step.
     """
 
     first: np.ndarray
@@ -209,7 +208,7 @@ class _Record:
 
     @property
     def length(self) -> np.ndarray:
-        """int [E], steps of the episode; T + 1 where it did not end."""
+        """int [E], steps of the episode; T + 1 if the episode did not end."""
         done = self.terminated | self.truncated
         return np.where(done.any(1), done.argmax(1) + 1, done.shape[1] + 1)
 
@@ -258,8 +257,8 @@ def _draw(seed: jax.Array, low: jax.Array, high: jax.Array, steps: int) -> tuple
 
 
 def _finite(record: _Record) -> Iterator[Finding]:
-    """Infinities and NaN within the first episodes."""
-    remedy = "look for a division by zero, a logarithm or a state that runs away"
+    """Finds infinities and NaN in the episodes."""
+    remedy = "look for a division by zero, a logarithm, or a state that grows without bound"
     if not np.all(np.isfinite(record.first)):
         yield Finding("finite", "the observation of reset is not finite", remedy)
         return
@@ -271,7 +270,7 @@ def _finite(record: _Record) -> Iterator[Finding]:
 
 
 def _scales(record: _Record) -> Iterator[Finding]:
-    """Sizes beside which others vanish, or which vanish beside others."""
+    """Finds observations and rewards that are too large or too small for a network."""
 
     def far(size: np.ndarray | float) -> np.ndarray:
         size = np.asarray(size)
@@ -285,9 +284,9 @@ def _scales(record: _Record) -> Iterator[Finding]:
         more = f", and {odd.size - 3} more" if odd.size > 3 else ""
         yield Finding(
             "scale",
-            f"the observation's sizes are far from one: {few}{more}",
-            "networks read it as it is: train with normalise_observations=True "
-            "(--normalise-observations), or divide each element by its usual size",
+            f"root mean squares of the observation are far from one: {few}{more}",
+            "train with normalise_observations=True (--normalise-observations), or divide each "
+            "element by its usual size",
             advice=True,
         )
     size = float(np.sqrt(np.mean(record.reward.astype(np.float64) ** 2)))
@@ -295,13 +294,13 @@ def _scales(record: _Record) -> Iterator[Finding]:
         yield Finding(
             "scale",
             f"rewards of {size:.1g} are far from one",
-            f"train with reward_scale={1 / size:.1g}; returns are reported without it",
+            f"train with reward_scale={1 / size:.1g}; returns are reported without this factor",
             advice=True,
         )
 
 
 def _pure(env: EnvironmentLike, params: object, record: _Record, seed: int) -> Iterator[Finding]:
-    """The same key and state that give another result."""
+    """Finds a reset or a step whose result changes for equal arguments."""
     state, action = _pick((record.last_state, record.last_action), 0)
 
     def both() -> tuple:
@@ -309,8 +308,8 @@ def _pure(env: EnvironmentLike, params: object, record: _Record, seed: int) -> I
         return env.reset(key, params), env.step(key, state, action, params)
 
     results = []
-    # The setting changes no number here. But it is part of the key under which JAX keeps programs,
-    # so that the Python code is run again, and what it takes from outside shows.
+    # The setting changes no number here. But it is part of the key under which JAX caches programs,
+    # so JAX runs the Python code again, and a value from outside the arguments shows.
     for rank_promotion in ("allow", "warn"):
         with warnings.catch_warnings(), jax.numpy_rank_promotion(rank_promotion):
             warnings.simplefilter("ignore")
@@ -320,14 +319,14 @@ def _pure(env: EnvironmentLike, params: object, record: _Record, seed: int) -> I
         if not all(_equal(results[0][index], other[index]) for other in results[1:]):
             yield Finding(
                 "pure",
-                f"{what} gives another result for the same key, state and action",
-                "keep everything that changes in the state, and draw with jax.random from the key",
+                f"{what} gives different results for the same key, state and action",
+                "keep every variable in the state, and draw with jax.random from the key",
             )
-            return  # an automatic reset is within step
+            return  # step contains the automatic reset: one finding is enough
 
 
 def _time_limits(record: _Record, limit: int | None, steps: int) -> Iterator[Finding]:
-    """A time limit that is reported as a termination, or not kept."""
+    """Finds a time limit that is reported as a termination, or has no effect."""
     longest = steps + 1 if limit is None else int(limit)
     known = longest <= steps
     at_limit: np.ndarray = record.length == (longest if known else record.length[0])
@@ -337,8 +336,8 @@ def _time_limits(record: _Record, limit: int | None, steps: int) -> Iterator[Fin
         yield Finding(
             "time-limit",
             f"all {EPISODES} episodes terminate at step {record.length[0]}: that is a time limit",
-            "report it as truncated, not as terminated, or bootstrapping stops there: "
-            "leave it to gymnax's is_truncated and params.max_steps_in_episode",
+            "report it as truncated, so that values are bootstrapped there: use gymnax's "
+            "is_truncated and params.max_steps_in_episode",
         )
     elif known and (record.length > longest).any():
         yield Finding(
@@ -350,17 +349,17 @@ def _time_limits(record: _Record, limit: int | None, steps: int) -> Iterator[Fin
         yield Finding(
             "time-limit",
             f"a time limit ends all {EPISODES} episodes at their first step",
-            "memories are then never trained on a second step, and the value of what follows may "
-            "run away: report the end as terminated if nothing follows it, or let episodes be "
-            "longer, or train td3, or with gamma=0",
+            "a memory is then never trained on a second step, and values may grow without bound: "
+            "report the end as terminated if no reward can follow, make episodes longer, or train "
+            "td3, or with gamma=0",
             advice=True,
         )
 
 
 def _final_observations(record: _Record) -> Iterator[Finding]:
-    """``final_observation`` that is not the observation before the reset."""
+    """Finds a ``final_observation`` that is not the observation before the automatic reset."""
     done = record.terminated | record.truncated
-    # XLA may compute the two by different fusions. That one is not finite is another finding.
+    # XLA may compute the two in different fusions. `_finite` reports an infinite one.
     size = np.max(np.abs(record.final), axis=(0, 1), initial=0.0, where=np.isfinite(record.final))
     alike = np.isclose(record.final, record.seen, rtol=0, atol=_DIGITS * size, equal_nan=True)
     inside, same = ~done, np.all(alike, axis=-1)
@@ -369,21 +368,21 @@ def _final_observations(record: _Record) -> Iterator[Finding]:
         yield Finding(
             "final-observation",
             "info['final_observation'] differs from the observation though the episode goes on",
-            "let it be the observation before the automatic reset at every step",
+            "return the observation before the automatic reset, at every step",
         )
     elif done.any() and moving and same[done].all():
         yield Finding(
             "final-observation",
             "info['final_observation'] of an ended episode is the next episode's first observation",
-            "take it before the automatic reset",
+            "return the observation before the automatic reset",
         )
 
 
 def _leaks(env: EnvironmentLike, params: object, record: _Record, seed: int) -> Iterator[Finding]:
-    """A new episode that depends on the one before it.
+    """Finds an episode that depends on the previous episode.
 
-    Two different episodes end with the same key, so that the automatic reset gets the same random
-    numbers; from then on both get the same keys and actions, and must look alike.
+    Two different episodes end with the same key, so the automatic resets draw the same random
+    numbers. From then on both get the same keys and actions, so their observations must be equal.
     """
     pairs = np.flatnonzero(record.ended)[:2]
     if len(pairs) < 2:
@@ -405,8 +404,8 @@ def _leaks(env: EnvironmentLike, params: object, record: _Record, seed: int) -> 
     if np.all(done) and not all(_close(part[0], part[1]) for part in new):
         yield Finding(
             "leak",
-            "an episode depends on the one before it: reset does not restore the whole state",
-            "make the state anew in reset_env, and let no wrapper carry parts of it over",
+            "an episode depends on the previous one: reset does not restore the whole state",
+            "create the whole state in reset_env, and let no wrapper keep parts of the old state",
         )
 
 
@@ -419,10 +418,11 @@ def _close(one: ArrayLike, other: ArrayLike) -> bool:
 
 
 def _equal(one: object, other: object) -> bool:
-    """Whether two results are the same, as far as two compilations of one program can be.
+    """Whether two results are equal, except for the rounding of two compilations.
 
-    XLA may fuse a program in two ways, whose last digits differ. The tolerance is that of float32
-    beside the largest number of an array; whole numbers and random keys have none. NaN equals NaN.
+    XLA may fuse a program in two ways, whose last digits differ. The tolerance is relative to the
+    largest number of an array, in float32; integers and random keys have no tolerance. NaN equals
+    NaN.
     """
 
     def same(a: jax.Array, b: jax.Array) -> bool:

@@ -1,7 +1,8 @@
-"""Controllers that an engineer writes down, as policies: any function, PID, LQR.
+"""Hand-designed controllers as policies: any function, PID and LQR.
 
-They are evaluated, drawn and tabulated like a trained policy. Gains are arrays of a pytree, so that
-other gains share a compiled program; a function is part of the program, so that each has its own.
+A controller is evaluated and shown in tables and figures like a trained policy. Gains are arrays of
+a pytree, so controllers with different gains share a compiled program. A function is part of its
+program, so each function has its own program.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,7 +23,7 @@ from rtd3jax.errors import UserError, first_line
 from rtd3jax.protocols import EnvironmentLike
 
 MOST_RICCATI_STEPS = 100_000
-"""Of the iteration; a controller that needs more has no horizon that matters here."""
+"""Iterations of the Riccati equation, at most."""
 
 _UNTRACEABLE = (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)
 
@@ -35,7 +36,7 @@ class FunctionPolicy:
     function: Callable[[Any, jax.Array], Any] = struct.field(pytree_node=False)
 
     def init(self, key: jax.Array | None = None) -> Any:
-        """The state before an episode's first step, always the same."""
+        """The state before the first step of an episode, the same for every episode."""
         return self.state
 
     def step(self, state: Any, observation: jax.Array) -> tuple[jax.Array, Any]:
@@ -46,7 +47,7 @@ class FunctionPolicy:
                 returned = self.function(state, observation)
         except _UNTRACEABLE as error:
             raise UserError(
-                f"{name} cannot be compiled: branch by jnp.where and compute by jax.numpy "
+                f"{name} cannot be compiled: use jnp.where for branches, and jax.numpy "
                 f"({first_line(error)})"
             ) from error
         if not isinstance(returned, tuple) or len(returned) != 2:
@@ -56,10 +57,10 @@ class FunctionPolicy:
         structures: list[Any] = [jax.tree.structure(tree) for tree in (state, after)]
         if structures[0] != structures[1] or shapes[0] != shapes[1]:
             raise UserError(
-                f"{name} must return a state of the shapes that it was given: {shapes[0]}, "
+                f"{name} must return a state of the same shapes as its argument: {shapes[0]}, "
                 f"not {shapes[1]}"
             )
-        # Loops keep a state's types; a Python number that was added must not change them.
+        # A loop needs a state of fixed types, which a Python number in the sum must not change.
         after = jax.tree.map(lambda new, old: jnp.asarray(new).astype(old.dtype), after, state)
         return jnp.atleast_1d(jnp.asarray(action, jnp.float32)), after
 
@@ -70,12 +71,12 @@ def function_policy(
     """Any function ``(state, observation [O]) -> (action [A], state)`` as a policy.
 
     Args:
-        function: pure, in ``jax.numpy``. It is part of the compiled program: define it once, for
-            each new function is compiled anew.
-        state: a pytree of numbers and arrays, what the function gets at an episode's first step.
+        function: a pure function in ``jax.numpy``. It is part of the compiled program: define it
+            once, because each new function is compiled again.
+        state: the state at the first step of an episode, a pytree of numbers and arrays.
 
     Raises:
-        UserError: for what is no function, or a state that JAX does not take.
+        UserError: if ``function`` is not a function, or JAX does not accept ``state``.
     """
     if not callable(function):
         raise UserError(f"function_policy needs a function, not {function!r}")
@@ -91,10 +92,10 @@ def function_policy(
 
 
 class PIDState(NamedTuple):
-    """What a PID controller remembers.
+    """The state of a PID controller.
 
     Attributes:
-        time: int32 [], observations so far.
+        time: int32 [], number of observations so far.
         integral: float32 [A], sum of the errors times the length of a step.
         error: float32 [A], the last error.
     """
@@ -122,7 +123,7 @@ class PIDPolicy:
     observation_size: int = struct.field(pytree_node=False)
 
     def init(self, key: jax.Array | None = None) -> PIDState:
-        """Nothing is integrated yet."""
+        """The state before the first step of an episode: zero integral and error."""
         zeros = jnp.zeros_like(self.low)
         return PIDState(jnp.int32(0), zeros, zeros)
 
@@ -131,11 +132,11 @@ class PIDPolicy:
         error = self.setpoint - observation[jnp.asarray(self.elements)].astype(jnp.float32)
         error = jnp.where(state.time < self.ignored, 0.0, error)
         integral = state.integral + error * self.seconds
-        # The first error has nothing before it from which it could have changed.
+        # The first error has no previous error, so its change is zero.
         change = jnp.where(state.time <= self.ignored, 0.0, error - state.error) / self.seconds
         wanted = self.feedforward + self.kp * error + self.ki * integral + self.kd * change
         action = jnp.clip(wanted, self.low, self.high)
-        # At a bound the integral stands still, unless it leads away from the bound: no wind-up.
+        # Against wind-up: at a bound, the integral changes only if this leads away from the bound.
         winds_up = (wanted - action) * self.ki * error > 0
         integral = jnp.where(winds_up, state.integral, integral)
         after = PIDState(state.time + jnp.int32(1), integral, error)
@@ -155,28 +156,30 @@ def pid_policy(
     ignored: int = 0,
     params: object = None,
 ) -> PIDPolicy:
-    """A PID controller for each element of the action, with feed-forward, without wind-up.
+    """A PID controller for each element of the action, with feed-forward and anti-windup.
 
     ``action = feedforward + kp e + ki sum(e) seconds + kd change(e) / seconds`` within the bounds
-    of ``env``, with ``e = setpoint - observation[elements]``. All but ``seconds`` and ``ignored``
-    are numbers or arrays [A].
+    of ``env``, with ``e = setpoint - observation[elements]``. All arguments except ``seconds`` and
+    ``ignored`` are numbers or arrays [A].
 
     Args:
-        env: the environment whose sizes and bounds count; it may be disturbed.
-        kp: of the error.
-        ki: of its integral.
-        kd: of its change.
-        setpoint: what the chosen elements of the observation should be.
-        feedforward: the action that needs no error.
-        elements: which element of the observation each element of the action heeds; the first A of
-            them by default.
-        seconds: length of a step; 1 counts in steps.
-        ignored: how many first observations say nothing. A plant at rest that answers at once to
-            each command shows there an error that no command has caused.
-        params: the environment's parameters; its own by default.
+        env: the environment, which defines sizes and bounds; it may be disturbed.
+        kp: gain of the error.
+        ki: gain of the error's integral.
+        kd: gain of the error's rate of change.
+        setpoint: target values of the chosen elements of the observation.
+        feedforward: the action at zero error.
+        elements: index of the observation's element that each element of the action controls; the
+            first A elements by default.
+        seconds: length of a step in seconds; with 1, time is counted in steps.
+        ignored: number of observations at the start of an episode that the controller ignores. If
+            the plant starts at rest and responds to each command within one step, then the error
+            of the first observation was not caused by any command.
+        params: the environment's parameters; its default parameters by default.
 
     Raises:
-        UserError: for gains of another shape, that are not finite, or elements that are not there.
+        UserError: for gains that have a wrong shape or are not finite, and for indices that the
+            observation does not have.
     """
     params = parameters_of(env, params)
     own = describe(env, params)
@@ -184,7 +187,7 @@ def pid_policy(
     if elements is None and own.observation_size < size:
         raise UserError(
             f"pid_policy: {own.observation_size} observation elements for {size} actions: "
-            "give elements=(...), the one that each action heeds"
+            "pass elements=(...), the index of the element that each action controls"
         )
     chosen = tuple(range(size)) if elements is None else tuple(elements)
     inside = all(isinstance(k, int | np.integer) and 0 <= k < own.observation_size for k in chosen)
@@ -218,16 +221,16 @@ class LinearPolicy:
     gain: jax.Array
     """float32 [A, O]"""
     at: jax.Array
-    """float32 [O], the observation about which it is linear"""
+    """float32 [O], the observation of the resting state"""
     action: jax.Array
-    """float32 [A], the action there"""
+    """float32 [A], the action of the resting state"""
     low: jax.Array
     high: jax.Array
     action_shape: tuple[int, ...] = struct.field(pytree_node=False)
     observation_size: int = struct.field(pytree_node=False)
 
     def init(self, key: jax.Array | None = None) -> tuple:
-        """No state."""
+        """The controller has no state."""
         return ()
 
     def step(self, state: tuple, observation: jax.Array) -> tuple[jax.Array, tuple]:
@@ -246,36 +249,37 @@ def lqr_policy(
     r: ArrayLike | Sequence[float] | None = None,
     params: object = None,
 ) -> LinearPolicy:
-    """The linear-quadratic regulator of ``env``, linearised about a resting state and its action.
+    """The linear-quadratic regulator of ``env``, linearised about an equilibrium.
 
-    The step of the undisturbed environment and the observation are linearised by ``jax.jacobian``;
-    the observation tells the state by its pseudo-inverse. The discrete Riccati equation is iterated
-    to its end.
+    ``jax.jacobian`` linearises the step and the observation of the undisturbed environment. The
+    pseudo-inverse of the observation matrix estimates the state. The discrete Riccati equation is
+    iterated until it converges.
 
     Args:
-        env: an environment with ``step_env``, whose step JAX can differentiate; it may be
-            disturbed, which the regulator does not know.
-        state: an environment's state, as ``env.reset`` returns it and with its fields replaced; of
-            a disturbed environment's, what lies in its field ``env`` counts. Its S elements are
+        env: an environment with ``step_env``, whose step JAX can differentiate. It may be
+            disturbed; the regulator does not model the disturbance.
+        state: the equilibrium: a state that ``env.reset`` returned, with replaced fields. For a
+            disturbed environment, only the field ``env`` of the state is used. The S elements are
             those of the floating-point leaves, in order.
-        action: a number or [A], under which that state stays as it is.
-        q: cost of the state's elements, [S] for a diagonal or [S, S]. By default the curvature of
-            minus the reward, as `r` then is too.
-        r: cost of the action's, a number, [A] or [A, A].
-        params: the environment's parameters; its own by default.
+        action: the action of the equilibrium, a number or [A].
+        q: cost of the state, [S] for a diagonal matrix, or [S, S]. By default, ``q`` and ``r`` are
+            the curvature of the negative reward.
+        r: cost of the action: a number, [A] or [A, A].
+        params: the environment's parameters; its default parameters by default.
 
     Raises:
-        UserError: for a state that does not stay as it is, a cost that is not convex, a step that
-            cannot be steered, or an observation that does not tell what the regulator must know.
+        UserError: for a state that is not an equilibrium, a cost that is not convex, a plant that
+            is not stabilisable, or an observation that does not determine the state elements that
+            the regulator uses.
     """
     params = parameters_of(env, params)
     own = describe(env, params)
     model = _linearised(env, state, action, params, own)
     if (q is None) != (r is None):
-        raise UserError("lqr_policy: give both q and r, or neither for the reward's curvature")
+        raise UserError("lqr_policy: pass both q and r, or neither to use the reward's curvature")
     if q is None or r is None:
         cost_x, cost_u, cross = model.curvature
-        hint = "; the reward's curvature is no such cost here: give q and r"
+        hint = "; the reward's curvature does not give such a cost here: pass q and r"
     else:
         cost_x, cost_u = _cost("q", q, len(model.names)), _cost("r", r, own.action_size)
         cross, hint = np.zeros((len(model.names), own.action_size)), ""
@@ -284,23 +288,23 @@ def lqr_policy(
     if not np.isfinite(whole).all() or np.linalg.eigvalsh(whole).min() < -1e-6 * scale:
         raise UserError(f"lqr_policy needs a cost that is not negative{hint}")
     if np.linalg.eigvalsh(cost_u).min() <= 0:
-        raise UserError(f"lqr_policy needs an action that costs something{hint}")
+        raise UserError(f"lqr_policy needs a positive cost of the action{hint}")
     gain = riccati_gain(model.a, model.b, cost_x, cost_u, cross)
     heeded = np.abs(gain).max(axis=0) > 1e-6 * max(np.abs(gain).max(), 1e-12)
     moved = np.abs(model.drift) > 1e-4
     if (heeded & moved).any():
         which = int(np.flatnonzero(heeded & moved)[0])
         raise UserError(
-            f"lqr_policy needs a state that stays as it is under its action: "
-            f"{model.names[which]} moves by {model.drift[which]:.3g} in a step"
+            f"lqr_policy needs an equilibrium: "
+            f"{model.names[which]} changes by {model.drift[which]:.3g} in a step"
         )
     inverse = np.linalg.pinv(model.c, rcond=1e-6)
     seen_gain = gain @ inverse
     unknown = np.abs(seen_gain @ model.c - gain).max(axis=0)
     if unknown.max() > 1e-3 * max(np.abs(gain).max(), 1e-12):
         raise UserError(
-            f"lqr_policy: the observation does not tell {model.names[int(unknown.argmax())]}, "
-            "which the regulator must know"
+            f"lqr_policy: the observation does not determine "
+            f"{model.names[int(unknown.argmax())]}, which the regulator uses"
         )
     return LinearPolicy(
         gain=jnp.asarray(seen_gain, jnp.float32),
@@ -318,11 +322,12 @@ def riccati_gain(
 ) -> np.ndarray:
     """The gain K [A, S] of ``u = -K x`` that minimises the sum of ``x'qx + 2 x'cross u + u'ru``.
 
-    ``x' = a x + b u`` with a [S, S] and b [S, A]. The iteration bears elements that cannot be
-    steered, if they fade by themselves.
+    ``x' = a x + b u`` with a [S, S] and b [S, A]. Elements that are not controllable are allowed if
+    they decay by themselves.
 
     Raises:
-        UserError: when it does not settle, because something that costs cannot be steered.
+        UserError: when the iteration does not converge, because an element with a cost cannot be
+            stabilised.
     """
     value = q.copy()
     for _ in range(MOST_RICCATI_STEPS):
@@ -336,17 +341,18 @@ def riccati_gain(
         if change <= 1e-10 * max(np.abs(value).max(), 1e-12):
             return gain
     raise UserError(
-        "lqr_policy: the Riccati equation does not settle: something that costs cannot be steered"
+        "lqr_policy: the Riccati equation does not converge: an element with a cost cannot be "
+        "stabilised"
     )
 
 
 class _Linear(NamedTuple):
-    """A step near a point, float64: S elements of the state, A of the action, O that are seen."""
+    """A linearised step, float64: S elements of the state, A of the action, O observed elements."""
 
     a: np.ndarray  # [S, S]
     b: np.ndarray  # [S, A]
     c: np.ndarray  # [O, S]
-    drift: np.ndarray  # [S], the step's change of the state at that point
+    drift: np.ndarray  # [S], change of the state in one step
     at: np.ndarray  # [O]
     action: np.ndarray  # [A]
     curvature: tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -367,7 +373,7 @@ def _linearised(
     if not callable(getattr(base, "step_env", None)):
         raise UserError(f"lqr_policy: {name} has no step_env, as gymnax's Environment has")
     if getattr(base, "supports_transition_gradients", False):
-        base = base.with_transition_gradients()  # gymnax's steps have none otherwise
+        base = base.with_transition_gradients()  # without this call, gymnax's steps stop gradients
     leaves, structure = jax.tree.flatten(strong(state))
     steered = [k for k, leaf in enumerate(leaves) if jnp.issubdtype(leaf.dtype, jnp.floating)]
     paths = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(state)]
@@ -402,21 +408,21 @@ def _linearised(
         (a, b), (c_a, c_b), _ = by_point
     except UserError:
         raise
-    except Exception as error:  # another's step, with another's state
+    except Exception as error:  # code of an environment may raise anything
         raise UserError(
             f"lqr_policy: {name} could not be linearised: {first_line(error)}"
         ) from error
     a, b, c_a, c_b = (np.asarray(m, np.float64) for m in (a, b, c_a, c_b))
     if not np.abs(b).max() > 0:
         raise UserError(
-            f"lqr_policy: the action does not move {name} there, or its step stops gradients"
+            f"lqr_policy: the action has no effect on {name} there, or its step stops gradients"
         )
-    # The step gives the observation of the state after it: c a and c b, from which c follows for
-    # all that a step can reach.
+    # The observation belongs to the state after the step: the Jacobians are c a and c b. They
+    # determine c for all states that a step can reach.
     c = np.hstack([c_a, c_b]) @ np.linalg.pinv(np.hstack([a, b]), rcond=1e-6)
     rows = seen_elements(env, params, c.shape[0])
     if len(rows) != own.observation_size:
-        raise UserError(f"lqr_policy: it is not known which elements {name} shows")
+        raise UserError(f"lqr_policy: it is not known which elements of the state {name} observes")
     (xx, xu), (_, uu) = ([-0.5 * np.asarray(part, np.float64) for part in line] for line in hessian)
     return _Linear(
         a=a,

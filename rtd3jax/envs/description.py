@@ -1,7 +1,7 @@
-"""What is known of an environment beside its dynamics; `rtd3jax.register` takes it.
+"""Baselines, ceiling and drawing of an environment, which `rtd3jax.register` takes.
 
-All of it is optional. A study shows the baselines and the ceiling beside the trained agents, and
-its page plays episodes with the drawing.
+All of these are optional. A study compares trained agents with the baselines and the ceiling, and
+the drawing defines how its page shows episodes.
 """
 
 import dataclasses
@@ -12,12 +12,13 @@ import jax
 
 
 class Ceiling(NamedTuple):
-    """A mean return, its standard error, and what it is.
+    """The best possible mean return of an environment, or an upper bound of it.
 
     Attributes:
-        mean: best possible mean return, or a bound from above.
-        standard_error: of ``mean``; of an integral, which has no luck in it, the grid's error.
-        kind: ``exact`` (the best policy's own return), or ``upper bound``.
+        mean: the best possible mean return, or an upper bound.
+        standard_error: the standard error of ``mean``; for an integral over all starts, which has
+            no sampling error, the error of the grid.
+        kind: ``exact`` (the best policy's return) or ``upper bound``.
     """
 
     mean: float
@@ -32,12 +33,14 @@ class Drawing:
     Attributes:
         observation: a name for each element of the undisturbed observation.
         action: a name for each element of the flat action.
-        kind: the page's scene, ``pendulum`` or ``rover``; without one the page draws curves alone.
-        constants: parameters of the environment that the scene needs, by name.
-        step_seconds: the parameter that holds the length of a step in seconds, if one does.
-        hidden: takes the environment's state before a step, and returns what the step's action
-            meets and the agent does not see, float32 [K]; or None where there is no such thing.
-        hidden_name: what that is.
+        kind: the page's scene, ``pendulum`` or ``rover``; without a scene, the page shows only
+            curves.
+        constants: names of the environment's parameters that the scene needs.
+        step_seconds: name of the parameter that holds the length of a step in seconds, if there is
+            one.
+        hidden: a function of the environment's state before a step. It returns the hidden variable
+            that acts in this step, float32 [K], or None if there is no hidden variable.
+        hidden_name: name of the hidden variable.
         hidden_elements: a name for each of its K elements.
     """
 
@@ -56,12 +59,12 @@ class Description:
     """Baselines, ceiling and drawing of one environment.
 
     Attributes:
-        baselines: by name, functions of the environment as it was made, disturbances included. Each
-            returns a policy, or the action of a policy that is constant; None where it has nothing
-            to say, such as a controller that does not see what it controls.
-        ceiling: takes the environment as it was made, how many episodes a random mean takes, and a
-            seed. It returns a `Ceiling`, or the best policy, whose return is then measured. It
-            raises UserError where neither is known.
+        baselines: functions by name. Each takes the environment with its disturbances and returns
+            a policy, or the action of a constant policy. It returns None if the baseline cannot be
+            used, for example for a controller that does not observe what it controls.
+        ceiling: a function of the environment with its disturbances, the number of episodes for a
+            mean that is sampled, and a seed. It returns a `Ceiling`, or the best policy, whose
+            return is then measured. It raises UserError if neither is known.
         drawing: how to show an episode.
     """
 
@@ -70,7 +73,7 @@ class Description:
     drawing: Drawing | None = None
 
     def or_else(self, other: "Description") -> "Description":
-        """This, with what ``other`` knows where this knows nothing."""
+        """This description, in which parts of ``other`` fill the empty parts."""
         return Description(
             self.baselines or other.baselines,
             self.ceiling or other.ceiling,

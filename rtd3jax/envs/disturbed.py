@@ -20,65 +20,65 @@ from rtd3jax.protocols import ComposableEnvironment, EnvironmentLike
 
 REWARDS_FROM = ("state", "observation")
 CHANNELS = ("observation", "action", "reward")
-"""What can be disturbed: fields of ``DisturbedParams``, each of which holds a process."""
+"""The channels that a process can disturb: each is a field of ``DisturbedParams``."""
 
-# Streams of the action's and the reward's processes, folded into the observation's key: far from
-# the small numbers by which processes fold and split it further.
+# Numbers that are folded into the key of the observation's process, for the keys of the action's
+# and the reward's processes. Processes themselves fold small numbers into their keys.
 _ACTION_STREAM, _REWARD_STREAM = 0x61637400, 0x72657700
 
 
 class DisturbedParams(struct.PyTreeNode):
-    """Parameters of the undisturbed environment, and the processes that disturb it."""
+    """Parameters of the wrapped environment, and the processes that disturb it."""
 
     env: Any
     observation: Process = NoDisturbance()
-    """of the observation [O]"""
+    """process of the observation [O]"""
     action: Process = NoDisturbance()
-    """of the flat action [A], between the agent and the environment"""
+    """process of the flat action [A], between the agent and the environment"""
     reward: Process = NoDisturbance()
-    """of the reward, as a signal [1]"""
+    """process of the reward, as a signal [1]"""
 
     @property
     def max_steps_in_episode(self) -> int | jax.Array:
-        """Episode length, a parameter of the undisturbed environment."""
+        """The time limit of an episode in steps, a parameter of the wrapped environment."""
         return self.env.max_steps_in_episode
 
     @property
     def process(self) -> Process:
-        """The observation's process, by the name of earlier versions."""
+        """The observation's process, under the name that earlier versions used."""
         return self.observation
 
 
 class DisturbedState(struct.PyTreeNode):
-    """One episode."""
+    """The state of one episode."""
 
     time: jax.Array
     """int32 []: steps taken"""
     env: Any
-    """state of the undisturbed environment"""
+    """state of the wrapped environment"""
     process: Any
-    """state of the observation's disturbance, reset with the episode"""
+    """state of the observation's process, drawn at the start of each episode"""
     action: ArrayLike
-    """state of the action's, likewise"""
+    """state of the action's process, drawn at the start of each episode"""
     reward: Any
-    """state of the reward's, likewise"""
+    """state of the reward's process, drawn at the start of each episode"""
     observation: jax.Array
-    """float32 [O]: what the agent saw last"""
+    """float32 [O]: the last observation that the agent received"""
 
 
 class Disturbed(ValueIdentity, environment.Environment):
     """``base`` with observation, action and reward passed through the processes of ``params``.
 
-    The observation's process sees the first observation of an episode, then one more at every step,
-    the final one included; the observation after an automatic reset belongs to a newly drawn
-    process. The dynamics never see it. The action's process changes what the dynamics receive, and
-    so whatever the reward charges for an action; the undisturbed environment limits it as it limits
-    any action.
+    The observation's process receives the first observation of an episode and the observation after
+    each step, including the final one. After an automatic reset, a newly drawn process receives the
+    observation. The disturbed observation never enters the dynamics. The dynamics receive the
+    disturbed action, so the reward also charges for the disturbed action; the wrapped environment
+    limits this action as it limits any action.
 
-    ``reward_from="observation"`` computes the reward from the observation that the agent saw before
-    it acted, the paper's ``noise`` case; the reward's process acts after that.
-    ``info["true_reward"]`` is always that of the true state, ``info["true_observation"]`` the
-    undisturbed observation.
+    With ``reward_from="observation"``, the reward is computed from the observation that the agent
+    received before it acted (the paper's ``noise`` case); the reward's process acts after this.
+    ``info["true_reward"]`` is always the reward of the true state, and ``info["true_observation"]``
+    is the undisturbed observation.
     """
 
     def __init__(
@@ -103,18 +103,18 @@ class Disturbed(ValueIdentity, environment.Environment):
         self._default_params = default_params
 
     def identity(self) -> tuple:
-        """The undisturbed environment, and the source of the reward."""
+        """The wrapped environment, and the source of the reward."""
         return (self.base, self.reward_from)
 
     @property
     def default_params(self) -> DisturbedParams:
-        """Those given at construction, else an undisturbed environment's."""
+        """The parameters given at construction; without them, no process disturbs anything."""
         if self._default_params is not None:
             return self._default_params
         return DisturbedParams(env=self.base.default_params)
 
     def _size(self, params: DisturbedParams, full: int) -> int:
-        """Elements seen of ``full``; raises UserError if a process does not fit its signal."""
+        """Elements of the disturbed observation; UserError if the process does not fit ``full``."""
         size = params.observation.output_size(full)
         if self.reward_from == "observation" and size != full:
             raise UserError(
@@ -125,7 +125,7 @@ class Disturbed(ValueIdentity, environment.Environment):
         return size
 
     def undisturbed_reset(self, key: jax.Array, params: DisturbedParams) -> tuple[jax.Array, Any]:
-        """What `reset_env` of the same key hides: the true first observation [S], and its state."""
+        """The undisturbed first observation [S] and the state, for the same key as `reset_env`."""
         key_env, _, _ = jax.random.split(key, 3)
         with foreign_code():
             observation, state = self.base.reset_env(key_env, params.env)
@@ -134,13 +134,13 @@ class Disturbed(ValueIdentity, environment.Environment):
     def reset_env(
         self, key: jax.Array, params: DisturbedParams
     ) -> tuple[jax.Array, DisturbedState]:
-        """Start an episode of all; returns the first observation [O]."""
+        """Start an episode and all processes; returns the first observation [O] and the state."""
         return self._begun(key, *self.undisturbed_reset(key, params), params)
 
     def reset_where(
         self, where: jax.Array, key: jax.Array, state: DisturbedState, params: DisturbedParams
     ) -> tuple[jax.Array, DisturbedState]:
-        """As `reset_env`, of a simulator's environment, which is reset only where ``where`` is."""
+        """As `reset_env`, for a simulator, which is reset only if ``where`` is true."""
         key_env, _, _ = jax.random.split(key, 3)
         first, env = self.base.reset_where(where, key_env, state.env, params.env)
         return self._begun(key, first, env, params)
@@ -148,7 +148,7 @@ class Disturbed(ValueIdentity, environment.Environment):
     def step(
         self, key: jax.Array, state: object, action: ArrayLike, params: object = None
     ) -> tuple:
-        """One step with automatic reset; a simulator is reset only at an episode's end."""
+        """One step with automatic reset; a simulator is reset only at the end of an episode."""
         if not is_simulated(self):
             return super().step(key, state, action, params)
         params = self.default_params if params is None else params
@@ -157,7 +157,7 @@ class Disturbed(ValueIdentity, environment.Environment):
     def _begun(
         self, key: jax.Array, true_observation: jax.Array, env: object, params: DisturbedParams
     ) -> tuple[jax.Array, DisturbedState]:
-        """The first observation and state, from those of the undisturbed environment."""
+        """The first observation and state, from those of the wrapped environment."""
         _, key_init, key_process = jax.random.split(key, 3)
         with foreign_code():
             actions = _action_size(self.base, params.env)
@@ -185,7 +185,7 @@ class Disturbed(ValueIdentity, environment.Environment):
         action: ArrayLike,
         params: DisturbedParams,
     ) -> tuple[jax.Array, DisturbedState, jax.Array, jax.Array, dict[Any, Any]]:
-        """One step of all; the observation [O] belongs to the episode even if it is its last."""
+        """One step without automatic reset; the observation [O] belongs to the same episode."""
         key_env, key_process = jax.random.split(key)
         key_action = jax.random.fold_in(key_process, _ACTION_STREAM)
         key_reward = jax.random.fold_in(key_process, _REWARD_STREAM)
@@ -218,17 +218,17 @@ class Disturbed(ValueIdentity, environment.Environment):
         return observation, strong(evolved), reward.reshape(()), terminated, info
 
     def is_terminated(self, state: DisturbedState, params: DisturbedParams) -> jax.Array:
-        """Whether the undisturbed environment ended by itself."""
+        """Whether the wrapped environment terminated."""
         return self.base.is_terminated(state.env, params.env)
 
     def is_truncated(self, state: DisturbedState, params: DisturbedParams) -> jax.Array:
-        """Whether the undisturbed environment reached its time limit."""
+        """Whether the wrapped environment reached its time limit."""
         with foreign_code():
             return self.base.is_truncated(state.env, params.env)
 
     @property
     def name(self) -> str:
-        """The name of the undisturbed environment."""
+        """The name of the wrapped environment."""
         return self.base.name
 
     @property
@@ -237,11 +237,11 @@ class Disturbed(ValueIdentity, environment.Environment):
         return self.base.num_actions
 
     def action_space(self, params: DisturbedParams | None = None) -> Any:
-        """The action space of the environment that is disturbed."""
+        """The action space of the wrapped environment."""
         return self.base.action_space((self.default_params if params is None else params).env)
 
     def observation_space(self, params: DisturbedParams | None = None) -> spaces.Box:
-        """Unbounded: a disturbance may leave the bounds of the environment that it disturbs."""
+        """A Box without bounds: a disturbed observation may leave the original bounds."""
         params = self.default_params if params is None else params
         size = self._size(params, _observation_size(self.base, params.env))
         return spaces.Box(-jnp.inf, jnp.inf, (size,), jnp.float32)
@@ -250,18 +250,18 @@ class Disturbed(ValueIdentity, environment.Environment):
 def disturb(
     env: EnvironmentLike, process: Process, channel: str = "observation", *, params: object = None
 ) -> Any:
-    """``env`` with one channel passed through ``process``, which is drawn anew every episode.
+    """``env`` with one channel passed through ``process``, which is drawn again in every episode.
 
-    Call it again for further channels or processes: those of one channel act in the order in which
-    they were added.
+    Call this function again to add other channels or processes. The processes of one channel act in
+    the order in which they were added.
 
     Args:
         env: a gymnax >= 1.0 environment with a flat observation and a bounded Box of actions.
-        process: of a signal [O] (observation), [A] (flat action, in the environment's units) or
-            [1] (reward).
+        process: a process of a signal: [O] (observation), [A] (flat action, in the environment's
+            units) or [1] (reward).
         channel: "observation", "action" or "reward".
-        params: the environment's parameters; its own by default. They and the process become the
-            ``default_params`` of what is returned.
+        params: the environment's parameters; its default parameters by default. The parameters
+            and the process become the ``default_params`` of the returned environment.
 
     Raises:
         UserError: for a process that does not fit, or an environment that cannot be composed.
@@ -299,7 +299,7 @@ def disturb(
 
 
 def sequence(*processes: Process) -> Process:
-    """The processes one after the other, as flat as can be."""
+    """The processes in sequence, without nested or empty chains."""
     flat: list[Process] = []
     for process in processes:
         if not isinstance(process, NoDisturbance):
@@ -308,10 +308,11 @@ def sequence(*processes: Process) -> Process:
 
 
 def seen_elements(env: EnvironmentLike, params: Any, size: int) -> list[int]:
-    """Which of the ``size`` elements of the undisturbed observation are seen, in their order.
+    """The indices of the undisturbed observation's elements that the agent observes, in order.
 
-    ``params`` are those of ``env``. Only `Hidden` is known to remove any: where the policy sees
-    another number of elements than are returned, nobody knows which they are.
+    ``params`` are the parameters of ``env``, and ``size`` is the size of the undisturbed
+    observation. The function knows only that `Hidden` removes an element. If the observation has
+    another size than the returned list, then it is not known which elements the agent observes.
     """
     elements = list(range(size))
     return _left(params.observation, elements) if isinstance(env, Disturbed) else elements
@@ -341,7 +342,7 @@ def check_processes(env: Disturbed) -> None:
         if process.output_size(size) != size:
             raise UserError(
                 f"{type(process).__name__} changes the number of elements, "
-                f"which the {what} does not allow"
+                f"which is not possible for the {what}"
             )
 
 
@@ -353,7 +354,7 @@ def _action_size(base: ComposableEnvironment, params: object) -> int:
 
 
 def _observation_size(base: ComposableEnvironment, params: object) -> int:
-    """Elements of the undisturbed observation; many environments declare no space."""
+    """Elements of the undisturbed observation; many environments declare no observation space."""
     with foreign_code():
         try:
             return base.observation_space(params).shape[0]

@@ -1,4 +1,4 @@
-"""What a user gives as an environment: a gymnax one, or refused with the remedy."""
+"""Checks of an environment that a caller passes, and its parameters."""
 
 from typing import Any
 
@@ -10,10 +10,10 @@ from rtd3jax.protocols import EnvironmentLike
 from rtd3jax.system.switches import check_switches
 
 DEFAULT_STEP_LIMIT = 10_000
-"""Steps after which an episode is cut where the environment names no time limit of its own."""
+"""The time limit of an episode, in steps, if the environment names none."""
 
 METHODS = ("reset", "step", "action_space")
-"""Without these nothing is a gymnax environment."""
+"""Methods that every gymnax environment has."""
 
 
 def parameters_of(env: EnvironmentLike, params: object = None) -> Any:
@@ -22,8 +22,8 @@ def parameters_of(env: EnvironmentLike, params: object = None) -> Any:
     Every function that takes an environment calls this first.
 
     Raises:
-        UserError: for what is no gymnax >= 1.0 environment, for a disturbance that cannot act
-            in its episodes, or under one of JAX's switches with which nothing here can work.
+        UserError: if ``env`` is not a gymnax >= 1.0 environment, if a disturbance cannot act in its
+            episodes, or if one of JAX's switches prevents evaluation and training.
     """
     check_switches()
     params = own_parameters(env, params)
@@ -32,7 +32,7 @@ def parameters_of(env: EnvironmentLike, params: object = None) -> Any:
 
 
 def own_parameters(env: EnvironmentLike, params: object = None) -> Any:
-    """`parameters_of` where nothing is computed, such as at an import: under any switch."""
+    """As `parameters_of`, without the checks of disturbances and of JAX's switches."""
     check_gymnax(env)
     if params is not None:
         return params
@@ -41,7 +41,7 @@ def own_parameters(env: EnvironmentLike, params: object = None) -> Any:
     except AttributeError as error:
         raise UserError(
             f"{type(env).__name__} has no default_params, as gymnax environments have: "
-            "add the property, or give params=..."
+            "add this property, or pass params=..."
         ) from error
 
 
@@ -53,12 +53,12 @@ def check_gymnax(env: object) -> None:
         )
     if isinstance(env, type):
         raise UserError(
-            f"{env.__name__} is a class, not an environment: make one of it, {env.__name__}()"
+            f"{env.__name__} is a class, not an environment: make an instance, {env.__name__}()"
         )
     if isinstance(env, tuple):
         raise UserError(
             "this is a tuple, not an environment: gymnax.make returns (env, params); "
-            "give env, and params=params if they are not its own"
+            "pass env, and params=params if they differ from its default parameters"
         )
     if isinstance(env, gymnasium.Env | gymnasium.vector.VectorEnv):
         raise UserError(

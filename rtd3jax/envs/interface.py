@@ -1,4 +1,4 @@
-"""What the learner needs to know of an environment, checked before anything is compiled."""
+"""Sizes and bounds of an environment, which are checked before anything is compiled."""
 
 import contextlib
 import dataclasses
@@ -15,12 +15,12 @@ from rtd3jax.errors import UserError
 from rtd3jax.protocols import EnvironmentLike
 
 MOST_BOUND = 1e20
-"""An action's bound from here on means "no limit": its square is beyond float32."""
+"""An action bound of this size means "no limit": its square overflows float32."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Interface:
-    """Sizes and bounds; A elements of a flat action."""
+    """Sizes of observation and action, and bounds of the flat action [A]."""
 
     observation_size: int
     action_shape: tuple[int, ...]
@@ -38,28 +38,31 @@ class Interface:
 
 @contextlib.contextmanager
 def foreign_code() -> Iterator[None]:
-    """Run others' environments under JAX's ordinary promotion, however strict this process is."""
+    """Run code of an environment under JAX's standard promotion, even if the process is strict."""
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         yield
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Survey:
-    """What tracing an environment shows. What could not be found out is None."""
+    """The result of tracing an environment; parts that could not be found are None."""
 
     interface: Interface | None
     problems: list[UserError]
-    """The worst first; with any of them the environment cannot be learned."""
+    """The most serious first; an environment with a problem cannot be trained on."""
     reset: tuple[Any, Any] | None
     """Shapes of (observation, state)."""
     step: tuple | None
-    """Shapes of the six values."""
+    """Shapes of the six values of step."""
 
 
 def describe(env: EnvironmentLike, params: object) -> Interface:
-    """Check that ``env`` is a gymnax >= 1.0 environment that can be learned, and measure it.
+    """Check that ``env`` is a gymnax >= 1.0 environment for training; return its sizes and bounds.
 
-    The environment is traced, not compiled. Whatever is wrong is a UserError with the remedy.
+    The environment is traced, not compiled.
+
+    Raises:
+        UserError: naming the problem and its remedy.
     """
     found = survey(env, params)
     if found.problems:
@@ -69,7 +72,7 @@ def describe(env: EnvironmentLike, params: object) -> Interface:
 
 
 def survey(env: EnvironmentLike, params: object) -> Survey:
-    """All that `describe` can find wrong, and the shapes that it saw."""
+    """All problems that `describe` can find, and the traced shapes."""
     name = environment_name(env)
     try:
         check_gymnax(env)
@@ -78,7 +81,7 @@ def survey(env: EnvironmentLike, params: object) -> Survey:
     problems: list[UserError] = []
 
     def noted(call: Callable[[], Any]) -> Any:
-        """The call's result, or None for one whose error was noted."""
+        """The call's result; None if the call raised an error, which is then noted."""
         try:
             return call()
         except UserError as error:
@@ -104,7 +107,7 @@ def survey(env: EnvironmentLike, params: object) -> Survey:
 
 
 def trace_reset(env: EnvironmentLike, params: object) -> tuple[Any, Any]:
-    """Shapes of the two values of reset; UserError if it fails or gives others."""
+    """Shapes of the two values of reset; UserError if reset fails or returns other values."""
     name, key = environment_name(env), jax.eval_shape(lambda: jax.random.key(0))
     with foreign_code():
         first = _attempt(name, "reset", lambda: jax.eval_shape(env.reset, key, params))
@@ -116,7 +119,7 @@ def trace_reset(env: EnvironmentLike, params: object) -> tuple[Any, Any]:
 def trace_step(
     env: EnvironmentLike, params: object, state: object, action: jax.ShapeDtypeStruct
 ) -> tuple:
-    """Shapes of the six values of step; UserError if it fails or gives another number."""
+    """Shapes of the six values of step; UserError if step fails or returns other values."""
     name, key = environment_name(env), jax.eval_shape(lambda: jax.random.key(0))
     with foreign_code():
         after = _attempt(name, "step", lambda: jax.eval_shape(env.step, key, state, action, params))
@@ -135,7 +138,7 @@ def trace_step(
 
 
 def action_bounds(env: EnvironmentLike, params: object) -> tuple[jax.Array, jax.Array]:
-    """Lowest and highest action, [A] each, flat; ``params`` may be traced."""
+    """Lowest and highest flat action, [A] each; ``params`` may be traced."""
     with foreign_code():
         space = env.action_space(params)
         low, high = (
@@ -149,12 +152,12 @@ def environment_name(env: object) -> str:
     """The name used in messages."""
     try:
         return str(getattr(env, "name", type(env).__name__))
-    except Exception:  # a name is for messages only, so a broken one must not hide the message
+    except Exception:  # the name is for messages only: an error in it must not hide the message
         return type(env).__name__
 
 
 def _attempt(name: str, what: str, call: Callable[[], Any]) -> Any:
-    """Run the environment's code; its errors become one line."""
+    """Run code of an environment; turn its errors into a one-line UserError."""
     try:
         return call()
     except UserError:
@@ -172,7 +175,7 @@ def _bounds(
     space = _attempt(name, "action_space", lambda: env.action_space(params))
     if hasattr(space, "n"):
         raise UserError(
-            f"environment {name} has discrete actions; rtd3jax learns continuous ones: "
+            f"environment {name} has discrete actions; rtd3jax needs continuous actions: "
             "choose an environment whose action space is a bounded Box"
         )
     if not all(hasattr(space, field) for field in ("low", "high", "shape")):
@@ -192,9 +195,8 @@ def _bounds(
         countable = bool(np.all(np.isfinite(high - low)))
     if largest >= MOST_BOUND or not countable:
         raise UserError(
-            f"environment {name}: the action's bounds reach {largest:.3g}, with which float32 "
-            "cannot calculate; where that stands for 'no limit', give the Box the range that the "
-            "plant can use"
+            f"environment {name}: the action's bounds reach {largest:.3g}, too large for "
+            "float32; if they stand for 'no limit', give the Box the range that the plant can use"
         )
     if low.size == 0 or not np.all(low < high):
         raise UserError(f"environment {name}: the action space needs low < high in every element")
@@ -222,7 +224,7 @@ def _check_observation(name: str, what: str, observation: Any) -> None:
 def _step_problems(
     name: str, after: tuple, first_observation: jax.ShapeDtypeStruct
 ) -> Iterator[UserError]:
-    """What is wrong with the six values of step."""
+    """The problems of the six values of step."""
     observation, _, reward, terminated, truncated, info = after
     try:
         _check_observation(name, "step", observation)

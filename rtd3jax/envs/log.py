@@ -1,4 +1,4 @@
-"""Logs that a user recorded, read as sequences of numbers without gaps."""
+"""Reads a recorded log as sequences of numbers without gaps."""
 
 import os
 from collections.abc import Sequence
@@ -9,14 +9,14 @@ import numpy as np
 from rtd3jax.errors import UserError, first_line, nearest
 from rtd3jax.system.files import user_path
 
-if TYPE_CHECKING:  # with it comes a second of imports
+if TYPE_CHECKING:  # importing pandas takes a second
     import pandas as pd
 
 EPISODE = "episode"
-"""The column that is taken to number the episodes where none is named."""
+"""The column that numbers the episodes, if the caller names none."""
 
 MOST_ROWS = 100_000_000
-"""Of a stretch that is interpolated: 800 MB of each element."""
+"""Rows of an interpolated sequence, at most: 800 MB for each element."""
 
 
 def read_log(
@@ -26,26 +26,26 @@ def read_log(
     period: float | None = None,
     step: float | None = None,
 ) -> list[np.ndarray]:
-    """The stretches of a log that have no gap, in their order: float64 [T, N] each.
+    """The sequences of a log without gaps, in the log's order: float64 [T, N] each.
 
     Args:
         log: a CSV or Parquet file, a pandas table, an array [T], [T, N] or [E, T, N] of E episodes,
             or a list of arrays [T, N], one for each episode.
-        columns: of a file or table, one for each element of the signal, in that order; by default
-            all columns but the episode's.
-        episode: the column of a file or table in which another value begins another episode;
-            "episode" by default, where there is such a column.
-        period: time in s between two samples of the log, which are taken to be equally spaced.
-        step: time in s between two steps of the environment. Where it differs from ``period``, the
-            samples are interpolated linearly within each stretch; nothing is smoothed before, so
-            what is faster than two steps folds back.
+        columns: columns of a file or table, one for each element of the signal, in that order; by
+            default all columns except the episode's.
+        episode: the column of a file or table that numbers the episodes: a new value begins a new
+            episode. By default "episode", if there is such a column.
+        period: time in s between two samples of the log, which must be equally spaced.
+        step: time in s between two steps of the environment. If ``step`` differs from ``period``,
+            the samples are interpolated linearly within each sequence. The samples are not smoothed
+            before this, so parts of the signal with a period of less than two steps are aliased.
 
-    A row in which any element is NaN, or empty, is a gap: the stretches before and after it are
-    two episodes, and nothing is filled in.
+    A row in which any element is NaN or empty is a gap. The sequences before and after a gap are
+    separate, and the gap is not filled.
 
     Raises:
-        UserError: for a file that cannot be read, columns that are not there, values that are no
-            finite numbers, or a log without any row.
+        UserError: for a file that cannot be read, missing columns, values that are not finite
+            numbers, or a log without rows.
     """
     what = "the recording"
     if isinstance(log, str | os.PathLike):
@@ -57,12 +57,12 @@ def read_log(
         for name, value in (("columns", columns), ("episode", episode)):
             if value is not None:
                 raise UserError(
-                    f"{name}={value!r} is for a file or a table; an array has no columns by name"
+                    f"{name}={value!r} is for a file or a table; an array has no names of columns"
                 )
         episodes = _episodes_of_arrays(what, log)
     stretches = [part for whole in episodes for part in _without_gaps(what, whole)]
     if not stretches:
-        raise UserError(f"{what} has no row with a number in every column: there is nothing in it")
+        raise UserError(f"{what} has no row with a number in every column")
     return _resampled(what, stretches, period, step)
 
 
@@ -74,17 +74,17 @@ def _read_table(path: str | os.PathLike) -> "pd.DataFrame":
     readers = {".csv": pd.read_csv, ".parquet": pd.read_parquet, ".pq": pd.read_parquet}
     read: Any = readers.get(file.suffix.lower())
     if read is None:
-        raise UserError(f"{path} is neither a .csv nor a .parquet file: write the log as one")
+        raise UserError(f"{path} is neither a .csv nor a .parquet file: write the log as either")
     try:
         if file.is_file() and file.stat().st_size == 0:
-            raise UserError(f"{path} is empty: write a line of column names, and rows of numbers")
+            raise UserError(f"{path} is empty: it needs a line of column names and rows of numbers")
         return read(file)
     except UserError:
         raise
     except OSError as error:
         reason = error.strerror or first_line(error)
         raise UserError(f"{path} cannot be read ({reason})") from error
-    except Exception as error:  # pandas and Arrow have many; none of them is a fault of ours
+    except Exception as error:  # pandas and Arrow raise many types of errors
         raise UserError(f"{path} cannot be read as a table ({first_line(error)})") from error
 
 
@@ -95,7 +95,7 @@ def _episodes_of_table(
     there = [str(name) for name in table.columns]
     table = table.set_axis(there, axis="columns")
     if len(set(there)) < len(there):
-        raise UserError(f"{what} has two columns of one name: {', '.join(there)}; rename one")
+        raise UserError(f"{what} has columns with equal names: {', '.join(there)}; rename them")
     chosen = [columns] if isinstance(columns, str) else columns
     if episode is None and EPISODE in there and EPISODE not in (chosen or ()):
         episode = EPISODE
@@ -108,47 +108,47 @@ def _episodes_of_table(
                 f"(it has: {', '.join(there)})"
             )
     if not chosen:
-        raise UserError(f"{what}: no column is left to play (it has: {', '.join(there)})")
+        raise UserError(f"{what} has no column besides the episode's (it has: {', '.join(there)})")
     numbers = [_numbers(what, name, table[name]) for name in chosen]
     values = np.stack(numbers, axis=1)
     if episode is None:
         return [values]
     labels = table[episode].to_numpy()
     if table[episode].isna().any():
-        raise UserError(f"{what}: column {episode!r} has rows without an episode; number them all")
+        raise UserError(f"{what}: column {episode!r} has empty rows; give every row an episode")
     begins = [0, *(np.flatnonzero(labels[1:] != labels[:-1]) + 1)] if len(labels) else []
     firsts = [labels[begin] for begin in begins]
     for place, label in enumerate(firsts):
         if label in firsts[:place]:
             raise UserError(
-                f"{what}: episode {label} goes on in row {begins[place]} after another one; sort "
-                f"the rows by {episode!r}"
+                f"{what}: episode {label} continues in row {begins[place]}, after rows of another "
+                f"episode; sort the rows by {episode!r}"
             )
     return [values[a:b] for a, b in zip(begins, [*begins[1:], len(values)], strict=True)]
 
 
 def _numbers(what: str, name: str, column: "pd.Series") -> np.ndarray:
-    """A column as float64 [T], NaN where it is empty."""
+    """A column as float64 [T]; empty cells become NaN."""
     import pandas as pd
 
     kind = column.dtype
-    if getattr(kind, "kind", "O") in "bcmM":  # truth values, complex numbers, times
+    if getattr(kind, "kind", "O") in "bcmM":  # booleans, complex numbers, times
         raise UserError(
-            f"{what}: column {name!r} holds {kind} and no numbers; leave it out by columns=[...]"
+            f"{what}: column {name!r} holds {kind}, not numbers; exclude it with columns=[...]"
         )
     numbers = pd.to_numeric(column, errors="coerce")
     odd = np.flatnonzero(numbers.isna().to_numpy() & column.notna().to_numpy())
     if odd.size:
         raise UserError(
-            f"{what}: column {name!r} has {column.iloc[odd[0]]!r} in row {odd[0]}, which is no "
-            "number; leave a gap empty, or choose other columns by columns=[...]"
+            f"{what}: column {name!r} has {column.iloc[odd[0]]!r} in row {odd[0]}, which is not "
+            "a number; leave the cells of a gap empty, or choose other columns with columns=[...]"
         )
     return numbers.to_numpy(np.float64, na_value=np.nan)
 
 
 def _episodes_of_arrays(what: str, log: object) -> list[np.ndarray]:
-    """Arrays [T, N] of an array, or of a list of arrays."""
-    # Lists of lists are rows, as numpy has it; a list of arrays is a list of episodes.
+    """The arrays [T, N] of the episodes in an array or in a list of arrays."""
+    # As in numpy, a list of lists is a list of rows; a list of arrays is a list of episodes.
     if isinstance(log, list | tuple) and any(hasattr(part, "shape") for part in log):
         return [one for part in log for one in _episodes_of_arrays(what, _array(what, part))]
     array = _array(what, log)
@@ -156,7 +156,7 @@ def _episodes_of_arrays(what: str, log: object) -> list[np.ndarray]:
         array = array[:, None]
     if array.ndim not in (2, 3):
         raise UserError(
-            f"{what} has shape {array.shape}; give [T], [T, N], [E, T, N], or a list of [T, N]"
+            f"{what} has shape {array.shape}; pass [T], [T, N], [E, T, N], or a list of [T, N]"
         )
     if array.shape[-1] == 0:
         raise UserError(f"{what} has no elements: its shape is {array.shape}")
@@ -171,24 +171,24 @@ def _array(what: str, values: object) -> np.ndarray:
         return array.astype(np.float64)
     except (TypeError, ValueError):
         raise UserError(
-            f"{what} holds no plain numbers: give a CSV or Parquet file, a pandas table, or an "
+            f"{what} does not hold numbers: pass a CSV or Parquet file, a pandas table, or an "
             f"array of floats, not {type(values).__name__}"
         ) from None
 
 
 def _is_narrow_float(array: np.ndarray) -> bool:
-    """bfloat16 and its like, which numpy knows as void."""
+    """Whether the type is bfloat16 or similar, which numpy classifies as void."""
     return array.dtype.name.startswith(("bfloat", "float"))
 
 
 def _without_gaps(what: str, values: np.ndarray) -> list[np.ndarray]:
-    """The stretches of [T, N] between rows with NaN."""
+    """The sequences of [T, N] between rows with NaN."""
     most = float(np.finfo(np.float32).max)
     if np.any(np.abs(values) > most):
         row = int(np.flatnonzero(np.any(np.abs(values) > most, axis=1))[0])
         raise UserError(
-            f"{what} is infinite in row {row} of an episode, or beyond float32; "
-            "leave such a row empty"
+            f"{what} is infinite in row {row} of an episode, or too large for float32; "
+            "leave this row empty"
         )
     whole = ~np.any(np.isnan(values), axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], whole, [False]]).astype(np.int8)))
@@ -198,15 +198,14 @@ def _without_gaps(what: str, values: np.ndarray) -> list[np.ndarray]:
 def _resampled(
     what: str, stretches: list[np.ndarray], period: float | None, step: float | None
 ) -> list[np.ndarray]:
-    """The stretches at the environment's steps."""
+    """The sequences, interpolated at the steps of the environment."""
     if len({part.shape[1] for part in stretches}) > 1:
         raise UserError(
-            f"{what} has episodes of {stretches[0].shape[1]} elements and of others; give every "
-            "episode the same elements"
+            f"{what} has episodes with different numbers of elements; give every episode the same"
         )
     if (period is None) != (step is None):
         raise UserError(
-            "period= (of the log, in s) and step= (of the environment, in s) come together"
+            "pass both period= (of the log, in s) and step= (of the environment, in s), or neither"
         )
     if period is None or step is None:
         return stretches
@@ -222,11 +221,11 @@ def _resampled(
         rows = (len(part) - 1) * period / step
         if rows >= MOST_ROWS:
             raise UserError(
-                f"step={step} makes {rows:.3g} rows of a stretch of {len(part):,}; both times are "
-                "in s: check them"
+                f"step={step} turns {len(part):,} rows into {rows:.3g} rows; check that period and "
+                "step are in s"
             )
         have = period * np.arange(len(part))
-        # The last sample counts, where a rounding error would leave it out.
+        # A rounding error must not exclude the last sample.
         want = step * np.arange(int(np.floor(have[-1] / step + 1e-9)) + 1)
         columns = [np.interp(want, have, part[:, k]) for k in range(part.shape[1])]
         found.append(np.stack(columns, axis=1))

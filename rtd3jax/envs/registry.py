@@ -1,4 +1,4 @@
-"""Environments by name, with a disturbance by name and parameters by name."""
+"""The registry: makes environments from the names of environment, disturbance and parameters."""
 
 import ast
 import dataclasses
@@ -47,25 +47,26 @@ _FAULTS: dict[str, tuple[str, Process]] = {
 }
 
 FAULTS: tuple[str, ...] = tuple(_FAULTS)
-"""The disturbances that fit any environment, a gymnax id included; not the paper's."""
+"""Disturbances that fit any environment, also one of gymnax; they are not in the paper."""
 
 NO_BASELINES = ("random", "ceiling", "upper bound")
-"""Names that a study gives to something else."""
+"""Names that a baseline cannot have, because a study uses them for something else."""
 
 
 @dataclasses.dataclass(frozen=True)
 class _Entry:
-    """What is registered under one id: an environment, or a function that makes it.
+    """An environment, or a function that makes one, registered under one id.
 
     Attributes:
         env: the environment without disturbances and with its own parameters.
-        construct: the function that sees to disturbances and parameters itself; None for ``env``.
-        disturbances: channel and process of each of the environment's own, by name.
-        registrant: the module that registered it: a notebook's cell that runs again may do it
-            again.
+        construct: the function, which itself applies disturbances and parameters; None if ``env``
+            is given.
+        disturbances: channel and process of each disturbance of this environment, by name.
+        registrant: the module that registered the entry; this module may register it again, as a
+            notebook's cell does when it runs twice.
         positive: parameters of the environment that must be greater than zero.
-        reward_from_observation: disturbances under which the reward is the observation's.
-        with_params: makes the environment with other default parameters.
+        reward_from_observation: disturbances under which the observation determines the reward.
+        with_params: a function that makes the environment with given default parameters.
         description: baselines, ceiling and drawing.
     """
 
@@ -84,20 +85,21 @@ _entries: dict[str, _Entry] = {}
 
 
 def make(env_id: str, disturbance: str = "none", **parameters: Any) -> Any:
-    """Make an environment whose ``default_params`` carry the disturbance and the parameters.
+    """Make an environment whose ``default_params`` hold the disturbance and the parameters.
 
     Args:
-        env_id: one of ``ENVIRONMENTS``, a registered id, a gymnax id, or ``gymnasium:`` and an id
-            of Gymnasium's.
-        disturbance: an id, or several joined by ``+``. Those that disturb the same thing act in
-            that order. Alternatives are separated by ``/``: each episode draws one of them (see
-            `rtd3jax.Mixture`; ``weights=(2,1)`` draws the first twice as often).
-        **parameters: fields of a disturbance, else of the environment's parameters. An environment
-            with ``observed_reward`` also has ``reward_from`` ("state" or "observation"). Its
-            default is "state", but for ``noise`` of the pendulum, as the paper has it [choice].
+        env_id: one of ``ENVIRONMENTS``, a registered id, a gymnax id, or a Gymnasium id after
+            ``gymnasium:``.
+        disturbance: a name, or several names joined by ``+``. Disturbances of one channel act in
+            the order of the names. ``/`` separates alternatives, of which each episode draws one
+            (see `rtd3jax.Mixture`; with ``weights=(2,1)``, it draws the first twice as often).
+        **parameters: fields of a disturbance, or else of the environment's parameters. An
+            environment with ``observed_reward`` also has ``reward_from`` ("state" or
+            "observation"). Its default is "state"; for the pendulum's ``noise`` it is
+            "observation", as in Section 5.2 of the paper [choice].
 
     Raises:
-        UserError: for an unknown id, disturbance or parameter, or a value that makes no sense.
+        UserError: for an unknown id, disturbance or parameter, or an impossible value.
     """
     entry = _entries.get(env_id)
     if entry is None and env_id in gymnax.registered_envs:
@@ -127,34 +129,37 @@ def register(
     try_disturbances: bool = True,
     replace: bool = False,
 ) -> None:
-    """Let ``make`` and the sweep know an environment by name. The package's own come this way too.
+    """Register an environment under a name, for ``make`` and the sweep.
 
     Args:
-        env_id: a new id, or one that the calling module itself registered, which is replaced: a
-            notebook's cell may run again.
-        env: a gymnax >= 1.0 environment, to which ``make`` then gives parameters and disturbances;
-            or a function ``(disturbance, **parameters)`` that returns one and sees to both itself.
-            The other arguments are for an environment, not for a function.
-        disturbances: of an environment, beside "none" and ``FAULTS``: the name of each, and its
-            process of the observation or its (channel, process). A channel is one that `disturb`
-            takes, or the name of a parameter of the environment that holds a process and acts
-            within the dynamics.
+        env_id: a new id, or an id that the calling module has registered, whose entry is then
+            replaced: a notebook's cell may run twice.
+        env: a gymnax >= 1.0 environment, to which ``make`` applies parameters and disturbances; or
+            a function ``(disturbance, **parameters)`` that returns an environment and applies both
+            itself. The other arguments are for an environment, not for a function.
+        disturbances: the disturbances of this environment besides "none" and ``FAULTS``: each name
+            with a process of the observation, or with a pair (channel, process). A channel is one
+            that `disturb` takes, or the name of a parameter of the environment that holds a
+            process and acts inside the dynamics.
         positive: parameters of the environment that must be greater than zero.
-        reward_from_observation: names of disturbances under which the reward is computed from the
-            observation that the agent saw, by the environment's ``observed_reward``, unless
-            ``reward_from`` is given to ``make``.
+        reward_from_observation: names of disturbances under which the environment's
+            ``observed_reward`` computes the reward from the observation that the agent received,
+            unless ``make`` is called with ``reward_from``.
         baselines: policies that need no training, by name; see
             `rtd3jax.envs.description.Description`.
-        ceiling: the best possible return, for `rtd3jax.ceiling` and a study: see there.
+        ceiling: the best possible return, for `rtd3jax.ceiling` and a study; see
+            `rtd3jax.envs.description.Description`.
         drawing: how the page of a study shows an episode.
-        with_params: makes the environment with other default parameters, such as its class. Where
-            it is given, ``make`` returns the environment itself if nothing outside its dynamics is
-            disturbed. Without it, ``make`` always composes it with its parameters.
-        try_disturbances: whether to trace the environment with each disturbance now.
-        replace: what another module registered under this id. Ours and gymnax's stay.
+        with_params: a function that makes the environment with given default parameters, for
+            example its class. With this function, ``make`` returns an unwrapped environment if no
+            channel of `disturb` is disturbed. Without it, ``make`` always wraps the environment.
+        try_disturbances: whether to trace the environment with each disturbance now, to find
+            errors.
+        replace: whether to replace an entry of another module. The ids of this package and of
+            gymnax cannot be replaced.
 
     Raises:
-        UserError: for an id or a name that is taken, or what is no environment.
+        UserError: for an id or a name that is taken, or an ``env`` that is not an environment.
     """
     module = sys._getframe(1).f_globals.get("__name__", "")
     if not isinstance(env_id, str) or not env_id:
@@ -168,8 +173,8 @@ def register(
     if not is_environment:
         if disturbances is not None or extras != ((), (), None, Description()):
             raise UserError(
-                f"{env_id!r}: disturbances and what else is known of an environment are for an "
-                "environment, not for a function"
+                f"{env_id!r}: disturbances, baselines and other arguments are for an environment, "
+                "not for a function that makes one"
             )
         _entries[env_id] = _Entry(None, cast("Callable[..., Any]", env), {}, module)
         return
@@ -186,9 +191,9 @@ def register(
 
 
 def description_of(env: EnvironmentLike, env_id: str | None = None) -> Description:
-    """What was registered with ``env_id``; without it, with an environment that equals ``env``.
+    """The description registered for ``env_id``, or else for an environment equal to ``env``.
 
-    ``env`` may be disturbed. What nobody registered has neither baselines, ceiling nor drawing.
+    ``env`` may be disturbed. For an environment that is not registered, the description is empty.
     """
     if env_id in _entries:
         return _entries[env_id].description
@@ -203,7 +208,7 @@ def disturbances_of(env_id: str) -> tuple[str, ...]:
 
 
 def _check_free(env_id: str, module: str, replace: bool) -> None:
-    """Raise UserError where ``module`` may not register ``env_id``."""
+    """Raise UserError if ``module`` may not register ``env_id``."""
     entry = _entries.get(env_id)
     ours = entry is not None and entry.registrant.startswith(f"{_PACKAGE}.")
     if ours or env_id in gymnax.registered_envs:
@@ -211,7 +216,7 @@ def _check_free(env_id: str, module: str, replace: bool) -> None:
     if entry is not None and not replace and entry.registrant != module:
         raise UserError(
             f"environment {env_id!r} exists already, registered by {entry.registrant}; choose "
-            "another id, or give replace=True"
+            "another id, or pass replace=True"
         )
 
 
@@ -224,7 +229,7 @@ def _check_extras(
     named: Mapping[str, tuple[str, Process]],
     extras: tuple[tuple[str, ...], tuple[str, ...], Callable[[Any], Any] | None, Description],
 ) -> None:
-    """Raise UserError, naming the argument of `register`, for what the environment has not."""
+    """Raise UserError if an argument of `register` does not fit the environment."""
     positive, reward_from_observation, with_params, description = extras
     params = own_parameters(env)
     fields = list(_settable(params))
@@ -261,7 +266,7 @@ def _check_extras(
 def _named_processes(
     env_id: str, env: EnvironmentLike, disturbances: Mapping[str, Any], tried: bool
 ) -> dict[str, tuple[str, Process]]:
-    """Channel and process of each name, each ``tried`` on the environment."""
+    """Channel and process of each name; if ``tried``, each is traced with the environment."""
     named = dict(_NONE)
     for name, value in disturbances.items():
         if not re.fullmatch(r"[\w.-]+", name) or name in (*named, *_FAULTS):
@@ -285,13 +290,13 @@ def _named_processes(
 
 
 def parse_disturbance(text: str) -> tuple[str, dict[str, Any]]:
-    """Read ``"noise:sigma=1.0,reward_from=state"`` as an id and its parameters.
+    """Parse ``"noise:sigma=1.0,reward_from=state"`` into a name and its parameters.
 
-    Values are Python literals where they can be (``elements=(0,1)``), else strings.
+    A value is read as a Python literal (``elements=(0,1)``) if possible, else as a string.
     """
     disturbance, _, rest = text.strip().partition(":")
     if not disturbance:
-        raise UserError(f"disturbance {text!r} has no id; write for example noise:sigma=1.0")
+        raise UserError(f"disturbance {text!r} has no name; write for example noise:sigma=1.0")
     parameters: dict[str, Any] = {}
     # A comma within parentheses belongs to a value.
     for item in re.split(r",(?![^(]*\))", rest) if rest.strip() else []:
@@ -320,7 +325,7 @@ def _lookup(env_id: str, entry: _Entry, names: list[str]) -> list[tuple[str, Pro
 
 
 def _disturbed(env_id: str, entry: _Entry, disturbance: str, parameters: dict[str, Any]) -> Any:
-    """The entry's environment, disturbed, with ``parameters`` shared out among them."""
+    """The entry's environment with its disturbances; each parameter goes to the one that has it."""
     base: Any = entry.env
     alternatives = [alternative.split("+") for alternative in disturbance.split("/")]
     names = [name for alternative in alternatives for name in alternative]
@@ -374,13 +379,13 @@ def _disturbed(env_id: str, entry: _Entry, disturbance: str, parameters: dict[st
 def _check_owners(
     what: str, names: list[str], processes: tuple[Process, ...], parameters: dict[str, Any]
 ) -> None:
-    """Raise UserError for a parameter that several of the joined disturbances have."""
+    """Raise UserError for a parameter that several of the disturbances have."""
     for name in parameters:
         owners = [n for n, p in zip(names, processes, strict=True) if name in _settable(p)]
         if len(owners) > 1:
             raise UserError(
-                f"{what}: {name!r} could be that of {' or '.join(owners)}; "
-                "join such disturbances with rtd.disturb"
+                f"{what}: {name!r} is a parameter of {' and of '.join(owners)}; "
+                "combine such disturbances with rtd.disturb"
             )
 
 
@@ -427,15 +432,15 @@ def _assign(
 
 
 def _settable(owner: object) -> dict[str, Any]:
-    """The fields that a plain value can set, with their defaults."""
-    if not dataclasses.is_dataclass(owner):  # others' parameters can be anything
+    """The fields that can be set to a number or a tuple, with their defaults."""
+    if not dataclasses.is_dataclass(owner):  # an environment's parameters may have any type
         return {}
     values = {field.name: getattr(owner, field.name) for field in dataclasses.fields(owner)}
     return {name: v for name, v in values.items() if isinstance(v, bool | int | float | tuple)}
 
 
 def _coerce(what: str, name: str, value: object, default: bool | int | float | tuple) -> Any:
-    """Return ``value`` as the kind of thing that ``default`` is, or raise UserError."""
+    """Convert ``value`` to the type of ``default``, or raise UserError."""
     wrong = f"{what}: {name}={value!r} must be"
     if isinstance(default, bool):
         if not isinstance(value, bool):

@@ -198,7 +198,7 @@ def test_what_the_picture_shows():
         (np.repeat([0.0, 0.5], 30), "ar1", {}, "nearly all slip in the log is at a bound"),
         (rtd.Recorded(np.arange(50.0)), "noise", {"step": 1}, "for the log that was read"),
         ([np.arange(6.0) / 10] * 5, "sine", {}, "no recording has 8 rows"),
-        (np.full(50, np.nan), "noise", {}, "there is nothing in it"),
+        (np.full(50, np.nan), "noise", {}, "has no row with a number in every column"),
     ],
 )
 def test_what_cannot_be_fitted_is_one_line(log, kind, arguments, match):

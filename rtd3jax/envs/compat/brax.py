@@ -1,8 +1,8 @@
-"""Brax-style environments, those of MuJoCo Playground above all, as gymnax environments.
+"""Wraps environments with Brax's interface, such as those of MuJoCo Playground, for gymnax.
 
-Such an environment has ``reset(rng) -> State`` and ``step(state, action) -> State``, its State the
-fields obs, reward, done, metrics and info; actions lie within one; randomness comes from a key
-within the state. Nothing of Brax is imported unless an environment is asked for by name.
+Such an environment has ``reset(rng) -> State`` and ``step(state, action) -> State``. Its State has
+the fields obs, reward, done, metrics and info. Actions lie within [-1, 1], and random numbers come
+from a key in the state. Nothing is imported from Brax unless an environment is made by its name.
 """
 
 from collections.abc import Iterable
@@ -20,11 +20,11 @@ from rtd3jax.envs.interface import foreign_code
 from rtd3jax.errors import UserError, nearest
 
 DEFAULT_EPISODE_LENGTH = 1_000
-"""Steps, as in Brax and in MuJoCo Playground's control suite."""
+"""Default time limit in steps, as in Brax and in MuJoCo Playground's control suite."""
 
 
 class BraxStateLike(Protocol):
-    """What such an environment's State has: arrays, or dicts of arrays."""
+    """The State of such an environment; its fields are arrays, or dicts of arrays."""
 
     obs: Any
     reward: Any
@@ -34,7 +34,7 @@ class BraxStateLike(Protocol):
 
 
 class BraxLike(Protocol):
-    """A Brax-style environment."""
+    """An environment with Brax's interface."""
 
     @property
     def action_size(self) -> int:
@@ -48,26 +48,27 @@ class BraxLike(Protocol):
 
 
 class BraxParams(struct.PyTreeNode):
-    """What can be set from outside; everything else is the environment's own."""
+    """Parameters of `BraxEnv`; the wrapped environment keeps all others itself."""
 
     max_steps_in_episode: int = DEFAULT_EPISODE_LENGTH
 
 
 class BraxState(struct.PyTreeNode):
-    """One episode."""
+    """The state of one episode."""
 
     time: jax.Array
     """int32 []: steps taken"""
     brax: Any
-    """the environment's own State"""
+    """the State of the wrapped environment"""
 
 
 class BraxEnv(ValueIdentity, environment.Environment):
-    """A Brax-style environment behind gymnax's interface; made by `from_brax`.
+    """Gymnax's interface around an environment with Brax's interface; made by `from_brax`.
 
-    ``done`` is a termination, except where the environment says in ``info["truncation"]``, as an
-    EpisodeWrapper does, that it is a time limit. An automatic reset is a whole reset with a new
-    key, computed at every step as everywhere in gymnax. ``info["metrics"]`` has the environment's.
+    ``done`` is a termination, unless ``info["truncation"]``, which Brax's EpisodeWrapper sets, marks
+    it as a time limit. The automatic reset is a full reset with a new key; as in all gymnax
+    environments, it is computed at every step. ``info["metrics"]`` holds the wrapped environment's
+    metrics.
     """
 
     def __init__(
@@ -84,28 +85,28 @@ class BraxEnv(ValueIdentity, environment.Environment):
         self._keep = keep
 
     def identity(self) -> tuple:
-        """The environment itself, and what is seen of it."""
+        """The wrapped environment, and the observed elements."""
         return (self.brax, self._observation_key, self._keep)
 
     @property
     def default_params(self) -> BraxParams:
-        """Those given at construction."""
+        """The parameters given at construction."""
         return self._default_params
 
     def reset_env(self, key: jax.Array, params: BraxParams) -> tuple[jax.Array, BraxState]:
-        """Start an episode; the observation is float32 [O]."""
+        """Start an episode; returns the observation, float32 [O], and the state."""
         with foreign_code():
-            # Brax-style code splits keys of the old kind, and compares their shapes.
+            # Brax's code splits keys of JAX's old type, and compares their shapes.
             brax = self.brax.reset(jax.random.key_data(key))
         return self._observe(brax), strong(BraxState(jnp.zeros((), jnp.int32), brax))
 
     def step_env(
         self, key: jax.Array, state: BraxState, action: ArrayLike, params: BraxParams
     ) -> tuple[jax.Array, BraxState, jax.Array, jax.Array, dict[Any, Any]]:
-        """One control step; ``key`` is not used, as the state has its own."""
+        """One control step; ``key`` is not used, because the state contains a key."""
         with foreign_code():
             brax = self.brax.step(state.brax, jnp.asarray(action, jnp.float32))
-            # A flag that was float32 at reset may come back as a bool, say.
+            # A flag that is float32 at reset may be bool after a step, for example.
             brax = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), brax, state.brax)
         evolved = strong(BraxState(state.time + 1, brax))
         reward = jnp.asarray(brax.reward, jnp.float32)
@@ -119,11 +120,11 @@ class BraxEnv(ValueIdentity, environment.Environment):
         return jnp.asarray(observation, jnp.float32)[np.asarray(self._keep)]
 
     def is_terminated(self, state: BraxState, params: BraxParams) -> jax.Array:
-        """Whether the episode ended by itself."""
+        """Whether the episode terminated."""
         return state.brax.done.astype(bool) & ~_truncation(state.brax)
 
     def is_truncated(self, state: BraxState, params: BraxParams) -> jax.Array:
-        """Whether a time limit was reached, this one or the environment's own."""
+        """Whether this time limit, or one of the wrapped environment, was reached."""
         return (state.time >= params.max_steps_in_episode) | _truncation(state.brax)
 
     @property
@@ -137,11 +138,11 @@ class BraxEnv(ValueIdentity, environment.Environment):
         return self.brax.action_size
 
     def action_space(self, params: BraxParams | None = None) -> spaces.Box:
-        """Actions within [-1, 1], which is what Brax's environments expect."""
+        """Actions within [-1, 1], as Brax's environments expect."""
         return spaces.Box(-1.0, 1.0, (self.brax.action_size,), jnp.float32)
 
     def observation_space(self, params: BraxParams | None = None) -> spaces.Box:
-        """Unbounded."""
+        """A Box without bounds."""
         return spaces.Box(-jnp.inf, jnp.inf, (len(self._keep),), jnp.float32)
 
 
@@ -152,21 +153,22 @@ def from_brax(
     observation_key: str | None = None,
     keep: Iterable[int] | None = None,
 ) -> BraxEnv:
-    """A Brax-style environment as a gymnax one, for `train`, `disturb`, `evaluate` and all else.
+    """Wrap an environment with Brax's interface as a gymnax environment.
 
-    ``rtd.from_brax("CheetahRun", keep=range(8))`` shows positions and hides velocities.
+    ``rtd.from_brax("CheetahRun", keep=range(8))`` observes positions and hides velocities.
 
     Args:
-        env: an environment of MuJoCo Playground or Brax without wrappers that vmap or reset, or
-            the name of one of MuJoCo Playground (``pip install 'rtd3jax[playground]'``), which is
-            then made with MJX's JAX physics.
-        max_steps_in_episode: the time limit, a truncation; by default the named environment's own,
-            else 1,000.
-        observation_key: which observation, where there is a dict of them; "state" by default.
-        keep: indices of the elements that are seen; all by default.
+        env: an environment of MuJoCo Playground or Brax, without wrappers that vmap or reset it; or
+            the name of an environment of MuJoCo Playground
+            (``pip install 'rtd3jax[playground]'``), which is then made with MJX's JAX physics.
+        max_steps_in_episode: the time limit, a truncation; by default the limit of the named
+            environment, or else 1,000.
+        observation_key: the key of the observation, if there is a dict of observations; "state" by
+            default.
+        keep: indices of the observed elements; all by default.
 
     Raises:
-        UserError: for what is not such an environment, or indices that it does not have.
+        UserError: if ``env`` is not such an environment, or does not have the indices.
     """
     if isinstance(env, str):
         env, length = _load(env)
@@ -175,7 +177,7 @@ def from_brax(
     for attribute in ("reset", "step", "action_size"):
         if not hasattr(env, attribute):
             raise UserError(
-                f"{name} has no {attribute}: it is not a Brax-style environment "
+                f"{name} has no {attribute}: it does not have Brax's interface "
                 "(reset(rng), step(state, action), action_size)"
             )
     length = DEFAULT_EPISODE_LENGTH if max_steps_in_episode is None else max_steps_in_episode
@@ -191,12 +193,12 @@ def from_brax(
 
 
 def _truncation(brax: BraxStateLike) -> jax.Array:
-    """bool []: what an EpisodeWrapper notes; False without one."""
+    """bool []: the flag that an EpisodeWrapper sets; False without the wrapper."""
     return jnp.asarray(brax.info.get("truncation", False)).astype(bool)
 
 
 def _load(name: str) -> tuple[Any, int]:
-    """An environment of MuJoCo Playground, and its episode's length."""
+    """An environment of MuJoCo Playground, and the length of its episodes."""
     try:
         from mujoco_playground import registry
     except ImportError as error:
@@ -211,7 +213,7 @@ def _load(name: str) -> tuple[Any, int]:
 
 
 def _first_state(env: BraxLike, name: str) -> BraxStateLike:
-    """Shapes of the State of reset."""
+    """Shapes of the State that reset returns."""
     key = jax.eval_shape(lambda: jax.random.key_data(jax.random.key(0)))
     try:
         with foreign_code():
@@ -221,33 +223,33 @@ def _first_state(env: BraxLike, name: str) -> BraxStateLike:
         raise UserError(f"{name} failed in reset: {type(error).__name__}: {reason}") from error
     missing = [f for f in ("obs", "reward", "done", "metrics", "info") if not hasattr(state, f)]
     if missing:
-        raise UserError(f"{name}: the State of reset lacks {', '.join(missing)}")
+        raise UserError(f"{name}: the State of reset has no {', '.join(missing)}")
     if any(str(key).endswith("first_obs") for key in state.info):
         raise UserError(
-            f"{name} resets by itself, which hides an episode's final observation: "
-            "give the environment without its AutoResetWrapper"
+            f"{name} resets automatically, which hides the final observation of an episode: "
+            "pass the environment without its AutoResetWrapper"
         )
     if state.reward.shape:
         raise UserError(
-            f"{name} is a batch of {state.reward.shape[0]}: give the environment without its "
+            f"{name} is a batch of {state.reward.shape[0]}: pass the environment without its "
             "VmapWrapper"
         )
     return state
 
 
 def _observation(name: str, state: BraxStateLike, key: str | None) -> tuple[str | None, int]:
-    """The key of the observation to be seen, if there are several, and its size."""
+    """The key of the observation, if there is a dict of observations, and its size."""
     observation = state.obs
     if isinstance(observation, dict) or hasattr(observation, "keys"):
         key = "state" if key is None else key
         if key not in observation:
             raise UserError(
                 f"{name} has no observation {key!r} (it has {', '.join(observation)}): "
-                "choose by observation_key"
+                "choose one with observation_key"
             )
         observation = observation[key]
     elif key is not None:
-        raise UserError(f"{name} has one observation and no keys; leave out observation_key")
+        raise UserError(f"{name} has no dict of observations; leave out observation_key")
     if len(observation.shape) != 1:
         raise UserError(
             f"{name}: the observation has shape {observation.shape}; flatten it to one dimension"

@@ -1,8 +1,8 @@
-"""Frames of an episode as pictures, for Gymnasium's ``render_mode="rgb_array"``.
+"""Draws frames of an episode, for Gymnasium's ``render_mode="rgb_array"``.
 
-To the left the plant, as the page draws it (pendulum, rover); to the right what the agent saw and
-did so far. An environment without a drawing has its signals alone. matplotlib is imported when the
-first frame is drawn.
+The left side shows the plant, as the page of a study draws it (pendulum, rover). The right side
+shows the observations and actions so far. For an environment without a drawing, the frame only
+shows these signals. matplotlib is imported when the first frame is drawn.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -17,34 +17,34 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 SIZE = (640, 360)
-"""Pixels: width and height of every frame."""
+"""Width and height of every frame in pixels."""
 _DPI = 100
 _SHOWN = 200
-"""Steps of the signals that a frame shows; the last ones of a longer episode."""
+"""Number of the last steps whose signals a frame shows."""
 _ELEMENTS = 8
-"""Elements of a signal that are drawn."""
+"""Elements of a signal that are drawn, at most."""
 _ROVER_SECONDS = 0.1
-"""A rover's step has no length; the pictures of the documentation draw it as this."""
+"""Assumed length of a rover's step in seconds, as in the pictures of the documentation."""
 
 
 class Episode:
-    """What happened in an episode, and its picture.
+    """Records an episode and draws its frames.
 
     Args:
-        env: the environment, ours or anyone's.
-        params: its parameters.
+        env: the environment.
+        params: the environment's parameters.
     """
 
     def __init__(self, env: EnvironmentLike, params: object) -> None:
         self._params: Any
-        while hasattr(env, "base"):  # beneath what disturbs it
+        while hasattr(env, "base"):  # the wrapped environment
             env, params = env.base, getattr(params, "env", params)
         self._plant, self._params = env, params
         self._figure: Any = None
         self.begin(np.zeros(0), None)
 
     def begin(self, observation: np.ndarray, state: Any) -> None:
-        """Forget the episode before. ``observation`` [...] is the first, ``state`` the first."""
+        """Begin a new episode with its first ``observation`` [...] and ``state``."""
         while hasattr(state, "env"):
             state = state.env
         self._seen = [np.ravel(observation)]
@@ -55,14 +55,14 @@ class Episode:
     def add(
         self, action: np.ndarray, observation: np.ndarray, reward: float, info: dict[str, Any]
     ) -> None:
-        """A step: what was done, what was seen after it, and what it earned."""
+        """Record a step: the action, the observation after it, and the reward."""
         self._actions.append(np.ravel(np.asarray(action, np.float64)))
         self._seen.append(np.ravel(observation))
         self._true.append(np.ravel(info.get("true_observation", observation)))
         self._rewards.append(float(reward))
 
     def frame(self) -> np.ndarray:
-        """The present moment: uint8 [height, width, 3]."""
+        """The frame of the last step: uint8 [height, width, 3]."""
         if self._figure is None:
             self._figure = _Figure(isinstance(self._plant, Pendulum | Rover))
         figure = self._figure
@@ -95,7 +95,7 @@ class Episode:
 
     def _draw_rover(self, axes: "Axes") -> None:
         target = np.array([self._params.target_speed, self._params.target_yaw_rate], np.float64)
-        # The start is at rest; what follows is the motion of each step.
+        # The rover starts at rest; the other rows are the motions of the steps.
         motion = np.array(self._true[1:]).reshape(-1, 2) + target
         path, heading = _path(motion)
         wanted, _ = _path(np.tile(target, (max(len(motion), 50), 1)))
@@ -110,11 +110,11 @@ class Episode:
             axes.set(**{f"{axis}lim": (centre - 0.6 * reach, centre + 0.6 * reach)})
         axes.set_aspect("equal")
         axes.tick_params(labelsize=6)
-        axes.set_title("path in metres; dashed: as it should be", fontsize=8)
+        axes.set_title("path in metres; dashed: target", fontsize=8)
 
 
 class _Figure:
-    """A figure that is drawn anew for each frame; only its axes are kept."""
+    """A figure that is cleared and drawn again for each frame; only its axes are kept."""
 
     def __init__(self, plant: bool) -> None:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -147,14 +147,14 @@ def _signals(axes: "Axes", name: str, times: np.ndarray, rows: list[np.ndarray])
 
 
 def _first_truth(plant: object, state: Any) -> np.ndarray:
-    """What the first observation would be without disturbance, of plants that have a drawing."""
+    """The undisturbed first observation, for plants that have a drawing."""
     if isinstance(plant, Pendulum) and state is not None:
         return np.array([np.cos(state.theta), np.sin(state.theta), state.theta_dot])
     return np.zeros(2)
 
 
 def _path(motion: np.ndarray) -> tuple[np.ndarray, float]:
-    """Positions [T + 1, 2] in metres of speeds and yaw rates [T, 2], and the last heading."""
+    """Positions [T + 1, 2] in m and the last heading, from speeds and yaw rates [T, 2]."""
     heading = np.cumsum(motion[:, 1]) * _ROVER_SECONDS
     velocity = motion[:, :1] * np.stack((np.cos(heading), np.sin(heading)), axis=1)
     places = np.concatenate((np.zeros((1, 2)), np.cumsum(velocity, axis=0) * _ROVER_SECONDS))

@@ -1,6 +1,6 @@
-"""Our environments as Gymnasium environments: one at a time, numpy in and out, seeded by reset.
+"""Wraps gymnax environments as Gymnasium environments, with numpy arrays, seeded by reset.
 
-gymnasium is imported by gymnax already, so that nothing here makes importing rtd3jax slower.
+gymnax imports gymnasium already, so this module does not make the import of rtd3jax slower.
 """
 
 import functools
@@ -32,31 +32,32 @@ from rtd3jax.protocols import EnvironmentLike
 NAMESPACE = "rtd3jax"
 
 _PROCESS = os.getpid()
-"""The process that imported JAX; forked ones inherit its locks but not its threads."""
+"""Id of the process that imported JAX; a forked process inherits its locks but not its threads."""
 
 _seen: dict[Any, tuple[gymnasium.Space, gymnasium.Space]] = {}
-"""Spaces of what was made, for forked processes, which cannot find them out. Those of an object go
-when it goes; of names the last `_MOST_SEEN` are kept."""
+"""Spaces of the environments that were made. A forked process cannot compute spaces and reads them
+here. The spaces of an object are removed with the object; of names, the last `_MOST_SEEN` are kept.
+"""
 _MOST_SEEN = 256
 
 
 def _check_process() -> None:
-    """Raise UserError in a forked process, where JAX would wait for ever."""
+    """Raise UserError in a forked process, in which JAX would hang."""
     if os.getpid() != _PROCESS:
         raise UserError(
-            "JAX does not work in a forked process, where it would hang; start processes with "
+            "JAX hangs in a forked process; start processes with "
             'spawn: AsyncVectorEnv(..., context="spawn"), or gymnasium.make_vec(..., '
             'vectorization_mode="async", vector_kwargs={"context": "spawn"})'
         )
 
 
 class GymnasiumEnv(gymnasium.Env):
-    """A gymnax environment behind Gymnasium's interface; made by `to_gymnasium`.
+    """Gymnasium's interface around a gymnax environment; made by `to_gymnasium`.
 
-    The reset and the step are compiled programs. ``step`` returns the final observation of an
-    episode and does not begin another; only ``reset`` does. A time limit is ``truncated``. ``info``
-    has what the environment put there, as numpy arrays. With ``render_mode="rgb_array"``,
-    ``render`` gives a picture, uint8 [height, width, 3].
+    Reset and step are compiled programs. At the end of an episode, ``step`` returns the final
+    observation; only ``reset`` begins a new episode. The time limit sets ``truncated``. ``info``
+    holds the environment's entries as numpy arrays. With ``render_mode="rgb_array"``, ``render``
+    returns a picture, uint8 [height, width, 3].
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
@@ -64,7 +65,7 @@ class GymnasiumEnv(gymnasium.Env):
     def __init__(self, env: Any, params: Any = None, render_mode: str | None = None) -> None:
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise UserError(
-                f"render_mode {render_mode!r} is unknown; there is 'rgb_array', or None"
+                f"render_mode {render_mode!r} is unknown; choose 'rgb_array' or None"
             )
         self.render_mode = render_mode
         self._episode: Any = None
@@ -79,7 +80,7 @@ class GymnasiumEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin an episode; a ``seed`` decides it and, without further seeds, all that follow."""
+        """Begin an episode; ``seed`` determines it and all later episodes until the next ``seed``."""
         _check_process()
         super().reset(seed=seed)
         self._key = np.uint32(self.np_random.integers(2**32, dtype=np.uint32))
@@ -95,10 +96,10 @@ class GymnasiumEnv(gymnasium.Env):
         return observation, {}
 
     def step(self, action: ArrayLike) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """One step of the episode; gymnasium.error.ResetNeeded after its end."""
+        """One step of the episode; raises gymnasium.error.ResetNeeded after its end."""
         _check_process()
         if self._over:
-            raise gymnasium.error.ResetNeeded("the episode is over, or none has begun: call reset")
+            raise gymnasium.error.ResetNeeded("the episode has ended, or none has begun: call reset")
         action = np.asarray(action, self.action_space.dtype).reshape(self.action_space.shape)
         time = np.uint32(self._time)
         final, self._state, reward, terminated, truncated, info = _step(
@@ -113,15 +114,15 @@ class GymnasiumEnv(gymnasium.Env):
         return observation, float(reward), bool(terminated), bool(truncated), info
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """The present moment, uint8 [height, width, 3]; None and a warning without a mode."""
+        """A frame, uint8 [height, width, 3]; without a render mode, None and a warning."""
         if self.render_mode is None:
             gymnasium.logger.warn(
-                'render() draws nothing without a mode: give render_mode="rgb_array" when the '
-                "environment is made"
+                'render() needs a mode: pass render_mode="rgb_array" when you make the '
+                "environment"
             )
             return None
         if self._episode is None:
-            raise gymnasium.error.ResetNeeded("there is nothing to draw yet: call reset")
+            raise gymnasium.error.ResetNeeded("no episode has begun: call reset")
         return self._episode.frame()
 
     def _observation(self, observation: Any) -> np.ndarray:
@@ -129,9 +130,9 @@ class GymnasiumEnv(gymnasium.Env):
 
 
 class _Forked(GymnasiumEnv):
-    """Stands for an environment in a forked process, until it can tell the parent: at reset.
+    """Replaces an environment in a forked process, and raises the error at reset.
 
-    What a vector environment's process raises earlier does not reach the one that uses it.
+    An error that a process of a vector environment raises before reset does not reach the parent.
     """
 
     def __init__(self, key: Any, render_mode: str | None) -> None:
@@ -142,23 +143,23 @@ class _Forked(GymnasiumEnv):
 
 
 def to_gymnasium(env: Any, *, params: Any = None, render_mode: str | None = None) -> GymnasiumEnv:
-    """Any gymnax >= 1.0 environment as a ``gymnasium.Env``, ours or anyone's, discrete or not.
+    """Wrap any gymnax >= 1.0 environment as a ``gymnasium.Env``; its actions may be discrete.
 
-    ``gymnasium.make("rtd3jax/Rover-ar1-slip-v0", sigma=0.1)`` does the same by name, once rtd3jax
-    is imported; ``gymnasium.make("rtd3jax:rtd3jax/Rover-ar1-slip-v0")`` imports it.
+    After ``import rtd3jax``, ``gymnasium.make("rtd3jax/Rover-ar1-slip-v0", sigma=0.1)`` does the same
+    by name; ``gymnasium.make("rtd3jax:rtd3jax/Rover-ar1-slip-v0")`` imports rtd3jax itself.
 
     Args:
         env: the environment; its time limit is reported as ``truncated``.
-        params: its parameters; its own by default.
-        render_mode: ``rgb_array`` for pictures by ``render``; None draws nothing.
+        params: the environment's parameters; its default parameters by default.
+        render_mode: ``rgb_array`` if ``render`` shall return pictures, or None.
 
     Raises:
-        UserError: for what is not a gymnax >= 1.0 environment; in forked processes.
+        UserError: if ``env`` is not a gymnax >= 1.0 environment, or in a forked process.
     """
     made = _made(id(env), render_mode, lambda: GymnasiumEnv(env, params, render_mode))
     try:
         weakref.finalize(env, _seen.pop, id(env), None)
-    except TypeError:  # of what cannot be followed, nothing is kept
+    except TypeError:  # an object without weak references: its spaces are not kept
         _seen.pop(id(env), None)
     return made
 
@@ -166,7 +167,7 @@ def to_gymnasium(env: Any, *, params: Any = None, render_mode: str | None = None
 def make_gymnasium(
     env_id: str, disturbance: str, render_mode: str | None = None, **parameters: Any
 ) -> GymnasiumEnv:
-    """The entry point of the registered ids."""
+    """The entry point of the ids that are registered with Gymnasium."""
     key = env_id, disturbance, repr(parameters)
 
     def construct() -> GymnasiumEnv:
@@ -175,12 +176,12 @@ def make_gymnasium(
     return _made(key, render_mode, construct)
 
 
-# Where gymnasium.make looks for the modes, so that it can make others ("rgb_array_list") of ours.
+# gymnasium.make reads the render modes here, to offer others such as "rgb_array_list".
 make_gymnasium.metadata = GymnasiumEnv.metadata  # type: ignore[attr-defined]
 
 
 def _made(key: Any, render_mode: str | None, construct: Callable[[], GymnasiumEnv]) -> GymnasiumEnv:
-    """What ``construct`` makes, or in a forked process what stands for it."""
+    """The environment that ``construct`` makes; in a forked process, its replacement."""
     if os.getpid() != _PROCESS:
         return _Forked(key, render_mode)
     env = construct()
@@ -196,7 +197,7 @@ def gymnasium_id(env_id: str, disturbance: str) -> str:
 
 
 def register_with_gymnasium() -> None:
-    """Register every environment with each of its disturbances; makes and imports nothing."""
+    """Register every environment with each of its disturbances; no environment is made."""
     for env_id, disturbances in DISTURBANCES.items():
         for disturbance in disturbances:
             if gymnasium_id(env_id, disturbance) not in gymnasium.registry:
@@ -208,7 +209,7 @@ def register_with_gymnasium() -> None:
 
 
 def _spaces(env: EnvironmentLike, params: object) -> tuple[gymnasium.Space, gymnasium.Space]:
-    """Spaces of actions and observations; UserError for what is no gymnax >= 1.0 environment."""
+    """Spaces of actions and observations; UserError if ``env`` is not a gymnax environment."""
     name = environment_name(env)
     with foreign_code():
         actions = _gymnasium_space(name, "action", env.action_space(params))
@@ -265,8 +266,8 @@ def _step(
     state: object,
     action: jax.Array,
 ) -> tuple:
-    """The six values, with the observation before any automatic reset."""
-    # Apart from the key of reset, which draws from the episode's key itself.
+    """The six values of step, with the observation before an automatic reset."""
+    # The key must differ from the key of reset, which is the episode's key itself.
     key = jax.random.fold_in(jax.random.fold_in(jax.random.key(key), 1 << 31), time)
     with foreign_code():
         _, state, reward, terminated, truncated, info = env.step(key, state, action, params)

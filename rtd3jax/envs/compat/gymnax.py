@@ -1,4 +1,4 @@
-"""gymnax's own environments by their ids."""
+"""Makes gymnax's environments by their ids."""
 
 from typing import Any
 
@@ -12,40 +12,40 @@ from rtd3jax.errors import UserError
 
 
 class _Preset(ValueIdentity):
-    """A gymnax environment whose ``default_params`` are given, and whose states are strong.
+    """A gymnax environment with given ``default_params`` and strongly typed states.
 
-    It is foreign code, which strict promotion would refuse.
+    gymnax's code runs under standard promotion, because it fails under strict promotion.
     """
 
     _preset_id: str
     _preset_params: Any
 
     def identity(self) -> tuple:
-        """The id: gymnax never lets an id be made anew by another factory."""
+        """The id: gymnax never registers another environment under the same id."""
         return (self._preset_id,)
 
     @property
     def default_params(self) -> Any:
-        """gymnax's, with the parameters given to ``make``."""
+        """gymnax's parameters, in which those given to ``make`` are replaced."""
         return self._preset_params
 
     def step(
         self, key: jax.Array, state: object, action: ArrayLike, params: object = None
     ) -> tuple:
-        """Step as gymnax does, with a strong state."""
+        """gymnax's step, with a strongly typed state."""
         with foreign_code():
             observation, state, *rest = super().step(key, state, action, params)
         return (observation, strong(state), *rest)
 
     def reset(self, key: jax.Array, params: object = None) -> tuple:
-        """Reset as gymnax does, with a strong state."""
+        """gymnax's reset, with a strongly typed state."""
         with foreign_code():
             observation, state = super().reset(key, params)
         return observation, strong(state)
 
 
 def make_gymnax(env_id: str, params: object = None) -> Any:
-    """gymnax's environment with ``params`` for its defaults; None means gymnax's own."""
+    """gymnax's environment with default parameters ``params``; None means gymnax's defaults."""
     try:
         base, defaults = gymnax.make(env_id)
     except Exception as error:

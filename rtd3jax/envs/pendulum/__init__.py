@@ -1,4 +1,4 @@
-"""gymnax's pendulum, whose observation is disturbed."""
+"""gymnax's pendulum, and the disturbances of its observation."""
 
 from rtd3jax.envs.pendulum.environment import Pendulum, PendulumParams, PendulumState
 

@@ -1,12 +1,13 @@
-"""What can be known about a pendulum's state: a Gaussian-sum filter.
+"""A Gaussian-sum filter for the state of a pendulum.
 
-The start is random, the dynamics are deterministic once the torque is known, and what is seen is
-disturbed. The posterior of the state is a sum of Gaussians, each with an extended Kalman filter of
-its own (Alspach and Sorenson, 1972; Anderson and Moore, Optimal Filtering, 1979, section 8.4). The
-first observation places them narrow enough for cos and sin to be nearly linear over each of them.
+The start is random, the dynamics are deterministic for a known torque, and the observation is
+disturbed. The posterior of the state is a sum of Gaussians, each with its own extended Kalman
+filter (Alspach and Sorenson, 1972; Anderson and Moore, Optimal Filtering, 1979, Section 8.4). The
+first observation determines the Gaussians; they are so narrow that cos and sin are nearly linear
+over each of them.
 
-Units: rad and rad/s. A state is (theta, theta dot); theta is not folded, as only its cosine and
-sine are used.
+Units: rad and rad/s. A state is (theta, theta dot); theta is not limited to one turn, because only
+its cosine and sine are used.
 """
 
 import math
@@ -20,20 +21,20 @@ from rtd3jax.envs.pendulum.environment import PendulumParams
 from rtd3jax.envs.pendulum.value_iteration import START_SPEED, swing
 
 DRIFT, DRIFT_PER_SIGMA = 1e-3, 1e-2
-"""Standard deviation that every step adds to both elements of the state, and its part that grows
-with the noise: room for the error of linearising, without which a filter of an undisturbed motion
-stops listening and may stay lost."""
+"""Standard deviation of the process noise per step of both elements of the state: a constant, and
+a factor of the observation noise. It covers the error of the linearisation. Without it, the
+covariance of an undisturbed motion shrinks to zero, and the filter may diverge."""
 
 
 @struct.dataclass
 class Sensor:
-    """What an observation (cos theta, sin theta, theta dot) tells.
+    """A model of the information in an observation (cos theta, sin theta, theta dot).
 
     Attributes:
-        sigma: standard deviation of the white noise on what is told.
-        first: float32 [3, 3], projection onto what the first observation tells.
-        later: float32 [3, 3], onto what the others tell: an offset of unknown size that several
-            elements share leaves their differences.
+        sigma: standard deviation of the white noise on the projected observation.
+        first: float32 [3, 3], projection onto the part of the first observation that is used.
+        later: float32 [3, 3], projection for all later observations. If several elements share an
+            unknown offset, only their differences are used.
     """
 
     sigma: jax.Array
@@ -42,7 +43,7 @@ class Sensor:
 
 
 class Belief(NamedTuple):
-    """A sum of M Gaussians.
+    """A sum of M Gaussians over the state.
 
     Attributes:
         log_weight: float32 [M], the logarithms of weights that add up to one.
@@ -56,16 +57,16 @@ class Belief(NamedTuple):
 
 
 def prior(sensor: Sensor, observation: jax.Array, angles: int, speeds: int) -> Belief:
-    """The distribution of starts, as far as the first observation [3] leaves it possible.
+    """The distribution of starts, limited to those that the first observation [3] allows.
 
-    The starts are uniform: theta over a turn and theta dot within 1. The part within six standard
-    deviations of what was seen is cut into ``angles`` times ``speeds`` equal cells, each of which
-    becomes a Gaussian of the cell's moments. `correct` then tells how likely each is.
+    The starts are uniform: theta over one turn, and theta dot in [-1, 1]. The part within six
+    standard deviations of the observation is divided into ``angles`` times ``speeds`` equal cells.
+    Each cell becomes a Gaussian with the cell's moments; `correct` then weights the Gaussians.
     """
     sees_angle, sees_speed = sensor.first[0, 0] > 0, sensor.first[2, 2] > 0
     reach = 6.0 * sensor.sigma
     seen = jnp.arctan2(observation[1], observation[0])
-    # Noise moves the direction by up to its length over the circle's radius, one.
+    # On the unit circle, noise changes the direction by at most its length.
     half_turn = jnp.where(sees_angle, jnp.minimum(reach, math.pi), math.pi)
     low = jnp.clip(
         jnp.where(sees_speed, observation[2] - reach, -jnp.inf), -START_SPEED, START_SPEED
@@ -111,9 +112,9 @@ def predict(belief: Belief, sensor: Sensor, params: PendulumParams, torque: jax.
 def correct(
     belief: Belief, sensor: Sensor, projection: jax.Array, observation: jax.Array
 ) -> Belief:
-    """The belief after ``observation`` [3], of which ``projection`` [3, 3] is told.
+    """The belief after ``observation`` [3], of which the part ``projection`` [3, 3] is used.
 
-    In information form, which works for projections of any rank.
+    The update is in information form, which allows projections of any rank.
     """
     precision = sensor.sigma**-2
 
@@ -141,8 +142,8 @@ def correct(
         after = adjugate @ covariance / determinant
         after = 0.5 * (after + after.T)
         pull = precision * slope.T @ surprise
-        # log N(surprise; 0, S) up to what all Gaussians share: by the matrix determinant lemma and
-        # Woodbury's identity for S = slope covariance slope' + sigma^2.
+        # log N(surprise; 0, S) without the term that all Gaussians share, by the matrix
+        # determinant lemma and Woodbury's identity for S = slope covariance slope' + sigma^2.
         fit = precision * surprise @ surprise - pull @ after @ pull
         return mean + after @ pull, after, -0.5 * (fit + jnp.log(determinant))
 
@@ -154,8 +155,8 @@ def correct(
 def sigma_points(belief: Belief) -> tuple[jax.Array, jax.Array]:
     """Weights [4 M] and states [4 M, 2] with the moments of each Gaussian.
 
-    The third-degree cubature rule: the mean, plus and minus sqrt(2) times the columns of the
-    covariance's Cholesky factor (Arasaratnam and Haykin, 2009).
+    The points are those of the third-degree cubature rule: the mean plus and minus sqrt(2) times
+    the columns of the covariance's Cholesky factor (Arasaratnam and Haykin, 2009).
     """
     variance, shared, other = (
         belief.covariance[:, 0, 0],

@@ -1,6 +1,7 @@
-"""gymnax's pendulum (paper, Section 5.2), with the reward as a function of what the agent sees.
+"""gymnax's pendulum (paper, Section 5.2), with the reward as a function of an observation.
 
-Units: rad, rad/s, N m; dt 0.05 s, torque within 2, speed within 8, 200 steps, never terminates.
+Units: rad, rad/s, N m. A step takes 0.05 s; the torque is limited to 2, the speed to 8; an
+episode has 200 steps and never terminates.
 The observation [3] is (cos theta, sin theta, theta dot).
 """
 
@@ -27,10 +28,10 @@ class Pendulum(ValueIdentity, pendulum.Pendulum):
     def observed_reward(
         self, observation: jax.Array, action: jax.Array, params: PendulumParams
     ) -> jax.Array:
-        """The reward [] of ``action`` [1] if ``observation`` [3], seen before acting, were true.
+        """The reward [] of ``action`` [1], computed as if ``observation`` [3] were the true state.
 
-        ``-(theta^2 + 0.1 thetadot^2 + 0.001 u^2)`` with theta from the observed direction; a
-        disturbed (cos, sin) need not have length one.
+        The reward is ``-(theta^2 + 0.1 thetadot^2 + 0.001 u^2)``, where theta is the direction of
+        the observed (cos, sin); a disturbed vector need not have length one.
         """
         theta = jnp.arctan2(observation[1], observation[0])
         limit = float32(params.max_torque)

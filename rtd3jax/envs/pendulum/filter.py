@@ -1,14 +1,16 @@
-"""A model-based reference for the disturbed pendulum: a Bayes filter with the optimal values.
+"""A model-based reference policy for the disturbed pendulum: a Bayes filter and optimal values.
 
 The filter (`rtd3jax.envs.pendulum.belief`) knows the dynamics, the distribution of starts and the
-disturbance. The torque maximises the value averaged over its belief (QMDP: Littman, Cassandra and
-Kaelbling, 1995), which averages over sides that the pendulum may be on where the best torque for
-the mean state would not. QMDP takes the state to be known from the next step on. Under noise it is
-not: the estimate keeps being kicked, so the values are those of a pendulum that is kicked alike.
+disturbance. The torque maximises the value averaged over the belief (QMDP: Littman, Cassandra and
+Kaelbling, 1995). The average takes into account that the pendulum may be on either side of the top;
+the torque for the mean state would not. QMDP assumes that the state is known from the next step on.
+Under noise it is not known: the estimate changes randomly at each step. The values are therefore
+those of a pendulum with an equal random disturbance of its state.
 
-What it earns is a lower bound of what can be earned. A sine adds one offset to several elements,
-and the first observation never carries one (sin 0 = 0): the state is known from then on, and the
-elements' differences keep the estimate true, so the wave's own parameters need not be inferred.
+The mean return of this policy is a lower bound of the optimal return. A sine adds the same offset
+to several elements, and the first observation never contains this offset (sin 0 = 0). So the first
+observation determines the state, the differences of the elements correct the estimate later, and
+the parameters of the wave need not be estimated.
 """
 
 from typing import NamedTuple
@@ -34,24 +36,24 @@ from rtd3jax.errors import UserError
 from rtd3jax.protocols import EnvironmentLike
 
 ANGLES, SPEEDS = 200, 160
-"""Grid intervals of the values under noise; twice as many where the state becomes known."""
+"""Grid intervals of the values under noise; without noise, twice as many are used."""
 
 STEPS = 200
-"""Values kept, by steps to go; with more to go the torque no longer depends on how many."""
+"""Number of value functions, by remaining steps; with more steps, the torque is the same."""
 
 EXACT = 1e-3
-"""Standard deviation that stands for none: above the rounding of float32 observations."""
+"""Standard deviation that is used without noise: above the rounding of float32."""
 
 KICK = 0.08
-"""Standard deviation of the estimate's kick per step, rad for a unit of sigma: a little less than a
-steady Kalman filter of the upright pendulum has."""
+"""Standard deviation of the estimate's random change per step, in rad per unit of sigma: a little
+less than that of a steady-state Kalman filter of the upright pendulum."""
 
 GAUSSIANS = 24
-"""The likeliest, over which the value is averaged."""
+"""Number of the most likely Gaussians, over which the value is averaged."""
 
 
 class FilterState(NamedTuple):
-    """What the policy remembers: its belief, the torque [] it gave last, int32 [] steps done."""
+    """State of the policy: the belief, the last torque [], and the number of steps, int32 []."""
 
     belief: Belief
     torque: jax.Array
@@ -60,13 +62,13 @@ class FilterState(NamedTuple):
 
 @struct.dataclass
 class FilterPolicy:
-    """The torque of the best value averaged over the belief; see `filter_policy`.
+    """The torque that maximises the value averaged over the belief; see `filter_policy`.
 
     Attributes:
         pendulum: the pendulum's parameters.
-        sensor: what observations tell.
-        values: float32 [K, angles, speeds + 1], by steps to go.
-        cells: Gaussians along the angle and along the speed.
+        sensor: the model of the observations.
+        values: float32 [K, angles, speeds + 1], values by remaining steps.
+        cells: number of Gaussians along the angle and along the speed.
         observation_size: 3, or 2 without the speed.
     """
 
@@ -77,7 +79,7 @@ class FilterPolicy:
     observation_size: int = struct.field(pytree_node=False)
 
     def init(self, key: jax.Array | None = None) -> FilterState:
-        """Nothing is known; the first observation makes the prior. ``key`` is not needed."""
+        """An empty belief, which the first observation replaces; ``key`` is not used."""
         count = self.cells[0] * self.cells[1]
         nothing = Belief(
             jnp.zeros((count,), jnp.float32),
@@ -87,7 +89,7 @@ class FilterPolicy:
         return FilterState(nothing, jnp.float32(0.0), jnp.int32(0))
 
     def step(self, state: FilterState, observation: jax.Array) -> tuple[jax.Array, FilterState]:
-        """The torque [1] for ``observation`` [observation_size], and the belief that gave it."""
+        """The torque [1] for ``observation`` [observation_size], and the next state."""
         missing = jnp.zeros((3 - self.observation_size,), jnp.float32)
         seen = jnp.concatenate((jnp.asarray(observation, jnp.float32), missing))
         first = state.time == 0
@@ -123,11 +125,11 @@ class FilterPolicy:
 def filter_policy(env: EnvironmentLike) -> FilterPolicy:
     """The model-based reference of a pendulum under ``env``'s disturbance.
 
-    It maximises the true state's reward, whichever reward ``env`` gives: that is what the tables
-    compare.
+    The policy maximises the reward of the true state, even if ``env`` computes the reward from the
+    observation: the tables compare returns of the true state.
 
     Args:
-        env: a pendulum, as it is or under ``noise``, ``hidden`` or one of the sines.
+        env: a pendulum, undisturbed or under ``noise``, ``hidden`` or one of the sines.
 
     Raises:
         UserError: for other environments and disturbances.
@@ -142,7 +144,7 @@ def filter_policy(env: EnvironmentLike) -> FilterPolicy:
             raise UserError("filter_policy does not cover disturbed actions or rewards")
         params = params.env
     if not isinstance(base, Pendulum):
-        raise UserError("filter_policy is known for the pendulum alone")
+        raise UserError("filter_policy is only known for the pendulum")
     sensor = _sensor(process)
     sigma = float(process.sigma) if isinstance(process, GaussianNoise) else 0.0
     noisy = sigma > EXACT
@@ -155,7 +157,7 @@ def filter_policy(env: EnvironmentLike) -> FilterPolicy:
 
 
 def _sensor(process: Process) -> Sensor:
-    """What observations under ``process`` tell."""
+    """The model of observations under ``process``."""
     everything = np.eye(3, dtype=np.float32)
     first = later = everything
     sigma = EXACT
@@ -168,7 +170,7 @@ def _sensor(process: Process) -> Sensor:
         later = everything - np.outer(mask, mask) / mask.sum()
     elif not isinstance(process, NoDisturbance):
         raise UserError(
-            f"filter_policy does not cover {type(process).__name__} as it is set here; it covers "
-            "noise, hidden without the speed, and sines that add to two elements or more"
+            f"filter_policy does not cover this {type(process).__name__}; it covers noise, a "
+            "hidden speed, and sines that disturb two elements or more"
         )
     return Sensor(jnp.float32(sigma), jnp.asarray(first), jnp.asarray(later))

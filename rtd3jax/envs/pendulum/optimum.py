@@ -1,8 +1,8 @@
 """The pendulum's best possible return, from its true state.
 
-It is the fully observable optimum, by `rtd3jax.envs.pendulum.value_iteration`; it bounds every
-disturbed case from above. `rtd3jax.envs.pendulum.filter` has a policy that bounds some of them from
-below.
+`rtd3jax.envs.pendulum.value_iteration` computes this optimum for a fully observed state. It is an
+upper bound for every disturbance of the observation. The mean return of the policy of
+`rtd3jax.envs.pendulum.filter` is a lower bound for some of them.
 """
 
 from rtd3jax.envs.description import Ceiling
@@ -14,9 +14,9 @@ from rtd3jax.protocols import EnvironmentLike
 
 
 def best_return(env: EnvironmentLike, episodes: int = 0, seed: int = 0) -> Ceiling:
-    """The undisturbed optimum: no disturbed pendulum can do better by its true state's reward.
+    """The optimal return without disturbances: an upper bound of the true return under any.
 
-    It is an integral over all starts, which needs neither episodes nor a seed.
+    The optimum is an integral over all starts, which needs neither ``episodes`` nor ``seed``.
 
     Raises:
         UserError: when the reward is itself disturbed.
@@ -25,7 +25,7 @@ def best_return(env: EnvironmentLike, episodes: int = 0, seed: int = 0) -> Ceili
     if isinstance(env, Disturbed):
         if env.reward_from != "state" or not isinstance(params.reward, NoDisturbance):
             raise UserError(
-                "a reward that is itself disturbed has no known ceiling; "
+                "the ceiling under a disturbed reward is not known; "
                 "make the environment with reward_from='state'"
             )
         disturbed = not (

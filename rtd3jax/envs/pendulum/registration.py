@@ -1,4 +1,4 @@
-"""The pendulum by name: disturbances, baseline, ceiling and drawing."""
+"""Registers the pendulum with its disturbances, baseline, ceiling and drawing."""
 
 from rtd3jax.envs.description import Drawing
 from rtd3jax.envs.pendulum.environment import Pendulum
@@ -36,5 +36,5 @@ register(
         constants=("max_torque",),
         step_seconds="dt",
     ),
-    try_disturbances=False,  # the tests do, and an import stays quick
+    try_disturbances=False,  # the tests do so; the import stays fast
 )

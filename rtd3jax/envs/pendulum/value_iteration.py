@@ -1,9 +1,9 @@
 """The pendulum's best possible return, by value iteration over a grid of its states.
 
-The horizon is finite (200 steps) and the dynamics are known and deterministic, so that backward
-induction gives the optimal value of every state up to the error of interpolating on the grid
-(Bellman, 1957). That error falls in proportion to the grid's spacing, so that two grids tell where
-it is going (Richardson's extrapolation), and a third one how well they tell it.
+The horizon is finite (200 steps), and the dynamics are known and deterministic. So backward
+induction gives the optimal value of every state, except for the interpolation error of the grid
+(Bellman, 1957). This error is proportional to the spacing of the grid. Two grids therefore allow
+Richardson's extrapolation, and a third grid estimates the error of the extrapolation.
 """
 
 import functools
@@ -17,17 +17,17 @@ from jax import lax
 from rtd3jax.envs.pendulum.environment import PendulumParams
 
 ANGLES, SPEEDS, TORQUES = 400, 320, 41
-"""Grid intervals of the angle (a full turn) and the speed; torques that are tried."""
+"""Grid intervals of the angle (a full turn) and of the speed; number of torques."""
 
 START_SPEED = 1.0
-"""Episodes start with theta ~ U(-pi, pi) and theta dot ~ U(-1, 1), in gymnax's code."""
+"""gymnax draws theta from U(-pi, pi) and theta dot from U(-1, 1) at the start of an episode."""
 
 
 @functools.lru_cache(maxsize=8)
 def optimal_value(
     params: PendulumParams, angles: int = ANGLES, speeds: int = SPEEDS
 ) -> tuple[np.ndarray, float]:
-    """The optimal return of each state at an episode's start.
+    """The optimal return of each state at the start of an episode.
 
     Args:
         params: of the pendulum; its numbers must be plain.
@@ -47,15 +47,15 @@ def optimal_value(
 def optimal_values(
     params: PendulumParams, angles: int, speeds: int, steps: int, kick: float = 0.0
 ) -> tuple[np.ndarray, float]:
-    """The optimal return of each state with 0, 1, ..., ``steps`` - 1 steps to go.
+    """The optimal return of each state with 0, 1, ..., ``steps`` - 1 remaining steps.
 
     Args:
         params: of the pendulum; its numbers must be plain.
         angles: as in `optimal_value`.
-        speeds: likewise.
-        steps: how many values to keep.
-        kick: standard deviation, rad, of a normal disturbance that moves the state after every
-            step along the upright pendulum's unstable direction: angle and speed together.
+        speeds: as in `optimal_value`.
+        steps: number of value functions.
+        kick: standard deviation, rad, of a normal disturbance after every step. It moves the state,
+            angle and speed together, along the unstable direction of the upright pendulum.
 
     Returns:
         Values float32 [steps, angles, speeds + 1] of states before the kick, and the top speed.
@@ -71,7 +71,7 @@ def optimal_values(
 
 
 def _kicked(value: jax.Array, params: PendulumParams, kick: float, top: float) -> jax.Array:
-    """Mean of ``value`` after the kick, by Gauss and Hermite's rule of three points."""
+    """Mean of ``value`` after the kick, by the three-point Gauss-Hermite rule."""
     angles, points = value.shape
     angle = -math.pi + 2 * math.pi * jnp.arange(angles, dtype=jnp.float32) / angles
     speed = jnp.linspace(-top, top, points, dtype=jnp.float32)
@@ -85,7 +85,7 @@ def _kicked(value: jax.Array, params: PendulumParams, kick: float, top: float) -
 
 
 def _backup(params: PendulumParams, angles: int, speeds: int):
-    """Bellman's backup of a value on the grid, the value with no step to go, and the top speed."""
+    """The Bellman backup on the grid, the value without remaining steps, and the top speed."""
     top = float(params.max_speed)
     angle = -math.pi + 2 * math.pi * jnp.arange(angles, dtype=jnp.float32) / angles
     speed = jnp.linspace(-top, top, speeds + 1, dtype=jnp.float32)
@@ -111,9 +111,9 @@ def mean_optimal_return(
 ) -> tuple[float, float]:
     """The optimal return's mean over the distribution of starts, and its error.
 
-    The mean is an integral, free of luck. It is extrapolated from a grid and one of twice the
-    spacing; the error is the distance to what the latter and one of four times the spacing promise.
-    ``angles`` and ``speeds`` must therefore be divisible by four.
+    The mean is an integral, without sampling error. It is extrapolated from a grid and a grid of
+    twice the spacing. The error is the difference to the extrapolation from twice and four times
+    the spacing. ``angles`` and ``speeds`` must therefore be divisible by four.
     """
 
     def on_grid(coarser: int) -> float:
@@ -128,9 +128,9 @@ def mean_optimal_return(
 def mean_over_starts(value: np.ndarray, top: float) -> float:
     """Mean of the interpolated ``value`` over the starts of episodes.
 
-    Between grid points the interpolation is linear along each axis, so that the mean over the
-    periodic angle is the mean over its grid points, and the trapezium rule is exact for the speed
-    where its nodes contain the grid's.
+    Between grid points, the interpolation is linear along each axis. So the mean over the periodic
+    angle is the mean over its grid points, and the trapezium rule is exact for the speed if its
+    nodes contain the nodes of the grid.
     """
     profile = value.mean(axis=0, dtype=np.float64)
     grid = np.linspace(-top, top, profile.size)
@@ -140,7 +140,7 @@ def mean_over_starts(value: np.ndarray, top: float) -> float:
 
 
 def interpolate(value: jax.Array, angle: jax.Array, speed: jax.Array, top: float) -> jax.Array:
-    """``value`` [angles, speeds + 1] between its grid points, bilinearly; periodic in the angle."""
+    """``value`` [angles, speeds + 1], interpolated bilinearly; periodic in the angle."""
     angles, points = value.shape
     row = (angle + math.pi) * (angles / (2 * math.pi))
     column = (speed + top) * ((points - 1) / (2 * top))
@@ -157,7 +157,7 @@ def interpolate(value: jax.Array, angle: jax.Array, speed: jax.Array, top: float
 def swing(
     params: PendulumParams, angle: jax.Array, speed: jax.Array, torque: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """gymnax's pendulum, over arrays of states: the next angle, the next speed, the reward."""
+    """gymnax's pendulum for arrays of states: the next angle, the next speed, and the reward."""
     g, mass, length, dt = params.g, params.m, params.l, params.dt
     folded = (angle + math.pi) % (2 * math.pi) - math.pi
     reward = -(folded**2 + 0.1 * speed**2 + 0.001 * torque**2)

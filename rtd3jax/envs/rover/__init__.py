@@ -1,4 +1,4 @@
-"""The rover whose wheels slip."""
+"""The rover with wheel slip (paper, Section 8.2)."""
 
 from rtd3jax.envs.rover.environment import Rover, RoverParams, RoverState
 

@@ -1,7 +1,7 @@
-"""A differential-drive rover whose wheels slip (paper, Section 8.2).
+"""A differential-drive rover with wheel slip (paper, Section 8.2).
 
-Units: m, s, rad. Left wheel first. The motion has no memory: each command sets the speeds of its
-own step. The only hidden thing is the slip, which acts inside the dynamics.
+Units: m, s, rad. The left wheel comes first. The motion has no inertia: each command sets the wheel
+speeds of its own step. The only hidden variable is the slip, which acts inside the dynamics.
 """
 
 from typing import Any
@@ -29,14 +29,13 @@ class RoverParams(struct.PyTreeNode):
     """rad/s"""
     slip: Process = NoDisturbance()
     max_speed: float = 1.0
-    """m/s, bound of the speed command [choice]: at a slip of at most 0.5, holding the target never
-    needs more"""
+    """m/s, bound of the speed command [choice]: enough to hold the target at a slip of up to 0.5"""
     max_yaw_rate: float = 1.0
-    """rad/s, bound of the yaw-rate command [choice], for the same reason"""
+    """rad/s, bound of the yaw-rate command [choice]: enough at a slip of up to 0.5"""
 
 
 class RoverState(struct.PyTreeNode):
-    """One episode."""
+    """The state of one episode."""
 
     time: jax.Array
     """int32 []: steps taken"""
@@ -49,7 +48,7 @@ class RoverState(struct.PyTreeNode):
 
 
 class Rover(ValueIdentity, environment.Environment):
-    """Hold a speed and a yaw rate: actions [2] command them, observations [2] are their errors."""
+    """Task: hold a speed and a yaw rate. Actions [2] command them; observations [2] are errors."""
 
     def __init__(self, default_params: RoverParams | None = None) -> None:
         super().__init__()
@@ -57,11 +56,11 @@ class Rover(ValueIdentity, environment.Environment):
 
     @property
     def default_params(self) -> RoverParams:
-        """Those given at construction, else a rover without slip."""
+        """The parameters given at construction; by default a rover without slip."""
         return RoverParams() if self._default_params is None else self._default_params
 
     def reset_env(self, key: jax.Array, params: RoverParams) -> tuple[jax.Array, RoverState]:
-        """Start at rest."""
+        """Start an episode at rest."""
         state = RoverState(
             time=jnp.zeros((), jnp.int32),
             speed=jnp.zeros((), jnp.float32),
@@ -73,7 +72,7 @@ class Rover(ValueIdentity, environment.Environment):
     def step_env(
         self, key: jax.Array, state: RoverState, action: ArrayLike, params: RoverParams
     ) -> tuple[jax.Array, RoverState, jax.Array, jax.Array, dict[Any, Any]]:
-        """Command ``action`` [2]; the reward [] is that of the motion it produced."""
+        """Command ``action`` [2]; the reward [] belongs to the resulting motion."""
         limit = _limits(params)
         command = jnp.clip(jnp.asarray(action, jnp.float32), -limit, limit)
         wheelbase = float32(params.wheelbase)
@@ -93,7 +92,7 @@ class Rover(ValueIdentity, environment.Environment):
         return observation, evolved, reward, terminated, {"true_reward": reward}
 
     def is_terminated(self, state: RoverState, params: RoverParams) -> jax.Array:
-        """Never: only the time limit ends an episode."""
+        """Always false: only the time limit ends an episode."""
         return jnp.zeros((), jnp.bool_)
 
     @property

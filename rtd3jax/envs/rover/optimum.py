@@ -1,8 +1,8 @@
-"""The rover's best policy, which a trained agent cannot exceed on average.
+"""The rover's optimal policy, whose mean return no agent can exceed.
 
-Slip is exogenous and the motion has no memory, so the best policy is myopic. The last action and
-the observation give the realised slip exactly; the best command then minimises the expected squared
-error under the conditional moments of the next slip.
+The slip does not depend on the actions, and the motion has no inertia, so the optimal policy is
+myopic. The last action and the observation determine the last slip exactly. The optimal command
+minimises the expected squared error, which the conditional moments of the next slip determine.
 """
 
 from typing import NamedTuple
@@ -22,12 +22,12 @@ from rtd3jax.protocols import EnvironmentLike
 
 
 class BayesState(NamedTuple):
-    """What the Bayes policy remembers.
+    """The state of the Bayes policy.
 
     Attributes:
-        nominal: float32 [2], wheel speeds last commanded, m/s.
-        slip: float32 [2], the slip last inferred.
-        time: int32 [], steps done.
+        nominal: float32 [2], the last commanded wheel speeds, m/s.
+        slip: float32 [2], the last inferred slip.
+        time: int32 [], number of steps so far.
     """
 
     nominal: jax.Array
@@ -37,18 +37,18 @@ class BayesState(NamedTuple):
 
 @struct.dataclass
 class BayesPolicy:
-    """The rover's best policy if its wheels slip as ``model`` says; see `bayes_policy`."""
+    """The rover's optimal policy if its slip follows ``model``; see `bayes_policy`."""
 
     params: RoverParams
     model: Process
 
     def init(self, key: jax.Array | None = None) -> BayesState:
-        """Nothing is known yet; ``key`` is not needed."""
+        """The state before the first step of an episode; ``key`` is not used."""
         zeros = jnp.zeros((2,), jnp.float32)
         return BayesState(zeros, zeros, jnp.int32(0))
 
     def step(self, state: BayesState, observation: jax.Array) -> tuple[jax.Array, BayesState]:
-        """The command [2] of least expected squared error."""
+        """The command [2] with the least expected squared error."""
         params = self.params
         slip = _inferred_slip(params, state, observation)
         first, second = _traction_moments(self.model, slip, state.time == 0)
@@ -60,50 +60,50 @@ class BayesPolicy:
 
 
 def bayes_policy(env: EnvironmentLike, model: Process | None = None) -> BayesPolicy:
-    """The best policy of a rover whose slip follows ``model``.
+    """The optimal policy of a rover whose slip follows ``model``.
 
     Args:
         env: a rover.
-        model: the slip process that the policy believes in; the environment's own by default. A
-            policy may meet another process than its model, as the robustness columns do.
+        model: the slip process that the policy assumes; the environment's process by default. The
+            policy can also be evaluated under another process, to test its robustness.
 
     Raises:
-        UserError: when ``env`` is no rover, or the model's moments are not known.
+        UserError: when ``env`` is not a rover, or the model's moments are not known.
     """
     if not isinstance(env, Rover):
-        raise UserError("bayes_policy is known for the rover alone")
+        raise UserError("bayes_policy is only known for the rover")
     params = env.default_params
     model = params.slip if model is None else model
     if not isinstance(model, Ar1Slip | NoDisturbance):
         raise UserError(
             f"the conditional moments of {type(model).__name__} are not known; "
-            "give an Ar1Slip as the model"
+            "pass an Ar1Slip as the model"
         )
     return BayesPolicy(params, model)
 
 
 def best_return(env: EnvironmentLike, episodes: int, seed: int) -> Ceiling | BayesPolicy:
-    """The best policy of a rover, whose return is its ceiling; under the sine slip, a bound.
+    """The optimal policy of a rover, whose return is the ceiling; an upper bound for sine slip.
 
     Args:
         env: a rover.
-        episodes: how many the bound averages.
-        seed: of these episodes.
+        episodes: number of episodes over which the bound is averaged.
+        seed: seed of these episodes.
 
     Raises:
         UserError: for a rover with faults, or a slip whose moments are not known.
     """
     if not isinstance(env, Rover):
-        raise UserError("the rover's ceiling is known under slip alone, without other faults")
+        raise UserError("the rover's ceiling is only known without disturbances other than slip")
     if isinstance(env.default_params.slip, SineSlip):
         return _sine_bound(env.default_params, episodes, seed)
     return bayes_policy(env)
 
 
 def _sine_bound(params: RoverParams, episodes: int, seed: int) -> Ceiling:
-    """A bound for the sine slip: from its second step on a clairvoyant errs nowhere.
+    """An upper bound for sine slip: the errors are assumed zero from the second step on.
 
-    At the first step nothing has been observed, so no policy does better there than the best
+    At the first step nothing has been observed, so no policy is better at this step than the best
     constant command under the prior.
     """
     keys = jax.random.split(jax.random.key(seed), episodes)
@@ -122,7 +122,7 @@ def _sine_bound(params: RoverParams, episodes: int, seed: int) -> Ceiling:
 
 
 def _inferred_slip(params: RoverParams, state: BayesState, observation: jax.Array) -> jax.Array:
-    """The slip [2] that turned the last command into the observed motion."""
+    """The slip [2] of the last step, from the last command and the observed motion."""
     speed = observation[0] + params.target_speed
     turn = 0.5 * params.wheelbase * (observation[1] + params.target_yaw_rate)
     realised = jnp.stack((speed - turn, speed + turn))
@@ -134,7 +134,7 @@ def _inferred_slip(params: RoverParams, state: BayesState, observation: jax.Arra
 def _traction_moments(
     model: Process, slip: jax.Array, first_step: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """E[1 - s] and E[(1 - s)^2] of the slip that the next command meets, per wheel: [2] each."""
+    """E[1 - s] and E[(1 - s)^2] of the slip of the next step, per wheel: [2] each."""
     if isinstance(model, NoDisturbance):
         ones = jnp.ones((2,), jnp.float32)
         return ones, ones
@@ -171,7 +171,8 @@ def _best_wheel_speeds(params: RoverParams, first: jax.Array, second: jax.Array)
 
     With tractions x and wheel speeds u the motion is v = (x_L u_L + x_R u_R)/2 and
     omega = (x_R u_R - x_L u_L)/b; the wheels slip independently, so the expectation is a quadratic
-    whose minimum solves two linear equations. The command's bounds are wide enough not to bind.
+    whose minimum solves two linear equations. The bounds of the command are so wide that they are
+    never active.
     """
     sum_weight, difference_weight = 0.25, 1.0 / params.wheelbase**2
     cross = (sum_weight - difference_weight) * first[0] * first[1]

@@ -1,4 +1,4 @@
-"""The rover by name: disturbances, baselines, ceiling and drawing."""
+"""Registers the rover with its disturbances, baselines, ceiling and drawing."""
 
 from typing import Any
 
@@ -15,18 +15,19 @@ from rtd3jax.protocols import EnvironmentLike
 
 
 def constant_command(env: EnvironmentLike) -> tuple[Any, Any]:
-    """The target itself, which a rover without slip would hold; ``env`` may have faults."""
+    """The target as a constant command, which is exact without slip; ``env`` may be disturbed."""
     params = env.default_params
     params = getattr(params, "env", params)
     return params.target_speed, params.target_yaw_rate
 
 
 def feedforward_pi(env: EnvironmentLike) -> PIDPolicy | None:
-    """The target fed forward, and a PI controller of both errors; None where one is not seen.
+    """Feed-forward of the target, and a PI controller of both errors; None if one is not observed.
 
-    The first observation shows a rover at rest, which no command has caused: it is ignored. The
-    gains are the best of a grid under ``ar1-slip``, on 1,000 episodes of seed 1000. They are tight:
-    where observations come late or wander, the loop swings, and the constant command does better.
+    The controller ignores the first observation: the rover is then at rest, which no command has
+    caused. The gains are the best of a grid under ``ar1-slip``, on 1,000 episodes of seed 1000. The
+    gains are high: if observations are delayed or drift, the loop oscillates, and the constant
+    command gives higher returns.
     """
     if describe(env, env.default_params).observation_size != 2:
         return None
@@ -34,7 +35,7 @@ def feedforward_pi(env: EnvironmentLike) -> PIDPolicy | None:
 
 
 def met_slip(state: RoverState) -> jax.Array | None:
-    """The slip [..., 2] that the next command meets; None where there is none."""
+    """The slip [..., 2] that acts in the next step; None without a slip process."""
     parts = state.slip if type(state.slip) is tuple else (state.slip,)
     return next((part.slip for part in parts if hasattr(part, "slip")), None)
 
@@ -56,12 +57,12 @@ register(
         observation=("speed error", "yaw-rate error"),
         action=("speed", "yaw rate"),
         kind="rover",
-        # The step has no length in seconds; the page says what it draws.
+        # The step has no length in seconds; the page states the length that it assumes.
         constants=("wheelbase", "target_speed", "target_yaw_rate"),
         hidden=met_slip,
         hidden_name="slip",
         hidden_elements=("left", "right"),
     ),
     with_params=Rover,
-    try_disturbances=False,  # the tests do, and an import stays quick
+    try_disturbances=False,  # the tests do so; the import stays fast
 )

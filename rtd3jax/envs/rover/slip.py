@@ -1,8 +1,8 @@
 """Wheel slip (paper, Section 8.2): hidden from the agent, independent for the two wheels.
 
-The signal is the nominal speed of the wheels [2] in m/s, left and right; what leaves is the
-realised speed, ``(1 - slip)`` times nominal. The slip of step t acts on ``a_t`` and then evolves.
-Every state has the current ``slip`` [2].
+The input signal is the nominal speed of the wheels [2] in m/s, left and right. The output is the
+realised speed, ``(1 - slip)`` times the nominal speed. The slip of step t acts on ``a_t`` and then
+evolves. Every state has a field ``slip`` [2], the current slip.
 """
 
 import jax
@@ -15,7 +15,7 @@ WHEELS = 2
 
 
 class Ar1SlipState(struct.PyTreeNode):
-    """The slip that the next action meets."""
+    """The slip that acts in the next step."""
 
     slip: jax.Array
     """float32 [2]"""
@@ -36,23 +36,23 @@ class Ar1Slip(Process):
     def step(
         self, key: jax.Array, state: Ar1SlipState, signal: jax.Array
     ) -> tuple[jax.Array, Ar1SlipState]:
-        """Slip, then evolve."""
+        """Apply the slip, then draw the slip of the next step."""
         noise = float32(self.sigma) * jax.random.normal(key, (WHEELS,), jnp.float32)
         evolved = jnp.clip(float32(self.rho) * state.slip + noise, 0.0, float32(self.max_slip))
         return (1.0 - state.slip) * signal, Ar1SlipState(slip=evolved)
 
     def validate(self) -> None:
-        """Check that the process is stationary and the slip physical."""
+        """Check that the process is stationary and the slip is physically possible."""
         require(self, "rho", low=0, high=1)
         require(self, "sigma", low=0)
         require(self, "max_slip", low=0, high=1)
 
 
 class SineSlipState(struct.PyTreeNode):
-    """An episode's waves, one for each wheel."""
+    """The waves of an episode, one for each wheel."""
 
     slip: jax.Array
-    """float32 [2], what the next action meets"""
+    """float32 [2], the slip that acts in the next step"""
     time: jax.Array
     """int32 []: step of the episode"""
     amplitude: jax.Array
@@ -66,8 +66,8 @@ class SineSlipState(struct.PyTreeNode):
 class SineSlip(Process):
     """``clip(A sin(2 pi t/T + phi) + offset, 0, max_slip)``, the "abstract" slip (paper, Exp2).
 
-    A is uniform, T uniform over the whole numbers from period_min to period_max, both included,
-    phi uniform in [0, 2 pi); all drawn per wheel and episode.
+    A is uniform; T is uniform over the integers from period_min to period_max, both included; phi
+    is uniform in [0, 2 pi). All are drawn for each wheel and episode.
     """
 
     amplitude_min: float = 0.08
@@ -111,7 +111,7 @@ class SineSlip(Process):
     def step(
         self, key: jax.Array, state: SineSlipState, signal: jax.Array
     ) -> tuple[jax.Array, SineSlipState]:
-        """Slip, then move on along the wave."""
+        """Apply the slip, then compute the slip of the next step."""
         time = state.time + 1
         slip = self._slip(time, state.amplitude, state.period, state.phase)
         return (1.0 - state.slip) * signal, state.replace(slip=slip, time=time)

@@ -103,6 +103,6 @@ def test_the_ceiling_says_what_it_is(monkeypatch):
     monkeypatch.setattr(optimum, "mean_optimal_return", lambda *_: (-136.0, 0.2))
     assert rtd.ceiling(rtd.make("pendulum")).kind == "exact"
     assert rtd.ceiling(rtd.make("pendulum", "random-sine")).kind == "upper bound"
-    with pytest.raises(rtd.UserError, match="itself disturbed has no known ceiling"):
+    with pytest.raises(rtd.UserError, match="the ceiling under a disturbed reward is not known"):
         rtd.ceiling(rtd.make("pendulum", "noise"))
     assert rtd.ceiling(rtd.make("pendulum", "noise", reward_from="state")).mean == -136.0
