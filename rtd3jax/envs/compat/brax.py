@@ -65,8 +65,8 @@ class BraxState(struct.PyTreeNode):
 class BraxEnv(ValueIdentity, environment.Environment):
     """Gymnax's interface around an environment with Brax's interface; made by `from_brax`.
 
-    ``done`` is a termination, unless ``info["truncation"]``, which Brax's EpisodeWrapper sets, marks
-    it as a time limit. The automatic reset is a full reset with a new key; as in all gymnax
+    ``done`` is a termination, unless ``info["truncation"]`` marks it as a time limit, as Brax's
+    EpisodeWrapper does. The automatic reset is a full reset with a new key; as in all gymnax
     environments, it is computed at every step. ``info["metrics"]`` holds the wrapped environment's
     metrics.
     """

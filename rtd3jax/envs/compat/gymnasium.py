@@ -64,9 +64,7 @@ class GymnasiumEnv(gymnasium.Env):
 
     def __init__(self, env: Any, params: Any = None, render_mode: str | None = None) -> None:
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise UserError(
-                f"render_mode {render_mode!r} is unknown; choose 'rgb_array' or None"
-            )
+            raise UserError(f"render_mode {render_mode!r} is unknown; choose 'rgb_array' or None")
         self.render_mode = render_mode
         self._episode: Any = None
         self.environment = env
@@ -80,7 +78,7 @@ class GymnasiumEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin an episode; ``seed`` determines it and all later episodes until the next ``seed``."""
+        """Begin an episode; ``seed`` determines it and all episodes until the next ``seed``."""
         _check_process()
         super().reset(seed=seed)
         self._key = np.uint32(self.np_random.integers(2**32, dtype=np.uint32))
@@ -99,7 +97,7 @@ class GymnasiumEnv(gymnasium.Env):
         """One step of the episode; raises gymnasium.error.ResetNeeded after its end."""
         _check_process()
         if self._over:
-            raise gymnasium.error.ResetNeeded("the episode has ended, or none has begun: call reset")
+            raise gymnasium.error.ResetNeeded("no episode is running: call reset")
         action = np.asarray(action, self.action_space.dtype).reshape(self.action_space.shape)
         time = np.uint32(self._time)
         final, self._state, reward, terminated, truncated, info = _step(
@@ -117,8 +115,7 @@ class GymnasiumEnv(gymnasium.Env):
         """A frame, uint8 [height, width, 3]; without a render mode, None and a warning."""
         if self.render_mode is None:
             gymnasium.logger.warn(
-                'render() needs a mode: pass render_mode="rgb_array" when you make the '
-                "environment"
+                'render() needs a mode: pass render_mode="rgb_array" when you make the environment'
             )
             return None
         if self._episode is None:
@@ -145,8 +142,8 @@ class _Forked(GymnasiumEnv):
 def to_gymnasium(env: Any, *, params: Any = None, render_mode: str | None = None) -> GymnasiumEnv:
     """Wrap any gymnax >= 1.0 environment as a ``gymnasium.Env``; its actions may be discrete.
 
-    After ``import rtd3jax``, ``gymnasium.make("rtd3jax/Rover-ar1-slip-v0", sigma=0.1)`` does the same
-    by name; ``gymnasium.make("rtd3jax:rtd3jax/Rover-ar1-slip-v0")`` imports rtd3jax itself.
+    After ``import rtd3jax``, ``gymnasium.make("rtd3jax/Rover-ar1-slip-v0", sigma=0.1)`` does the
+    same by name; ``gymnasium.make("rtd3jax:rtd3jax/Rover-ar1-slip-v0")`` imports rtd3jax itself.
 
     Args:
         env: the environment; its time limit is reported as ``truncated``.

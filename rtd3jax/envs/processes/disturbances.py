@@ -1,7 +1,7 @@
 """Disturbances of an observation [O] (paper, Section 5.2). Time is counted in environment steps.
 
-They act on what the agent sees, never on the true state. Every draw is made once per episode,
-unless a docstring says otherwise.
+They change what the agent observes, never the true state. All random parameters are drawn once per
+episode, unless a docstring says otherwise.
 """
 
 import jax
@@ -15,7 +15,7 @@ from rtd3jax.errors import UserError
 
 
 def element_mask(elements: tuple[int, ...], size: int) -> np.ndarray:
-    """Ones [O] at the disturbed elements, zeros elsewhere."""
+    """A mask [O]: ones at the disturbed elements, zeros elsewhere."""
     mask = np.zeros(size, np.float32)
     mask[list(elements)] = 1.0
     return mask
@@ -31,42 +31,42 @@ def check_elements(process: object, elements: tuple[int, ...], size: int | None 
 
 
 def _between(key: jax.Array, low: ArrayLike, high: ArrayLike, shape: tuple[int, ...]) -> jax.Array:
-    """Uniform float32 draws between two parameters."""
+    """Uniform float32 random numbers between two parameters."""
     return jax.random.uniform(key, shape, jnp.float32, float32(low), float32(high))
 
 
 class PulsesState(struct.PyTreeNode):
-    """Where the episode is in the placement of its pulses; all scalars []."""
+    """State of the placement of pulses in an episode; all fields are scalars []."""
 
     slots: jax.Array
-    """int32: places left, a place being either one free step or one whole pulse."""
+    """int32: number of remaining places; a place is one free step or one whole pulse."""
     pulses: jax.Array
-    """int32: pulses still to come."""
+    """int32: number of pulses that have not begun."""
     running: jax.Array
-    """int32: steps left of the pulse under way, 0 between pulses."""
+    """int32: remaining steps of the active pulse, 0 between pulses."""
     amplitude: jax.Array
-    """float32: of the latest pulse."""
+    """float32: amplitude of the last pulse."""
 
 
 class Pulses(Process):
     """``temporal-bias``: short constant offsets at random steps (paper, Section 5.2).
 
-    All placements in which the pulses do not overlap and all fit the episode are equally likely.
-    They are found on the way: a place becomes a pulse with probability (pulses left) / (places
-    left), which is Knuth's selection sampling (TAOCP 3.4.2, algorithm S). So a reset costs nothing,
-    which matters where an automatic reset is computed at every step. In an episode too short
-    for all pulses they follow one another from the start until it ends.
+    All placements of the pulses without overlap within the episode are equally likely. The process
+    draws the placement step by step: a place becomes a pulse with probability (remaining pulses) /
+    (remaining places). This is Knuth's selection sampling (TAOCP 3.4.2, algorithm S). A reset then
+    takes almost no time, which matters because an automatic reset is computed at every step. If the
+    episode is too short for all pulses, the pulses follow one another from its start to its end.
     """
 
     amplitude_min: float = 0.5
     amplitude_max: float = 1.0
-    """The amplitude is drawn per pulse [choice]: the paper gives the range only."""
+    """The amplitude is drawn per pulse [choice]: the paper only gives the range."""
     count: int = struct.field(pytree_node=False, default=10)
     length: int = struct.field(pytree_node=False, default=3)
     elements: tuple[int, ...] = struct.field(pytree_node=False, default=(0, 1))
 
     def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> PulsesState:
-        """All pulses to come."""
+        """The state in which no pulse has begun."""
         zero = jnp.zeros((), jnp.int32)
         return PulsesState(
             slots=jnp.asarray(horizon, jnp.int32) - self.count * (self.length - 1),
@@ -78,7 +78,7 @@ class Pulses(Process):
     def step(
         self, key: jax.Array, state: PulsesState, signal: jax.Array
     ) -> tuple[jax.Array, PulsesState]:
-        """Start a pulse or not; add the one that runs."""
+        """Decide whether a pulse begins; add the active pulse."""
         key_start, key_amplitude = jax.random.split(key)
         idle = state.running == 0
         draw = jax.random.uniform(key_start, (), jnp.float32) * state.slots.astype(jnp.float32)
@@ -114,7 +114,7 @@ class Pulses(Process):
 
 
 class SineState(struct.PyTreeNode):
-    """An episode's waves; W waves."""
+    """The W waves of an episode."""
 
     time: jax.Array
     """int32 []: step of the episode."""
@@ -127,11 +127,11 @@ class SineState(struct.PyTreeNode):
 
 
 class Sine(Process):
-    """Waves ``A sin(2 pi (t - t0)/T)``, each lasting one period (paper, Section 5.2).
+    """Waves ``A sin(2 pi (t - t0)/T)`` of one period each (paper, Section 5.2).
 
     The defaults are ``random-sine``; ``temporal-sine`` fixes A = 1 and T = 70, ``combined-sine``
-    has two waves. The start is a whole step, uniform over those from which a whole period fits the
-    episode [choice]; it is 0 if none does.
+    has two waves. The start t0 is an integer, uniform over the steps after which a whole period
+    fits into the episode [choice]; it is 0 if there is no such step.
     """
 
     amplitude_min: float = 0.5
@@ -190,7 +190,7 @@ class DampedSine(Process):
     elements: tuple[int, ...] = struct.field(pytree_node=False, default=(0, 1, 2))
 
     def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> SineState:
-        """Draw amplitude, period and start of the one wave."""
+        """Draw amplitude, period and start of the wave."""
         key_amplitude, key_period, key_start = jax.random.split(key, 3)
         start = jax.random.randint(key_start, (1,), 0, jnp.asarray(horizon, jnp.int32), jnp.int32)
         return SineState(
@@ -203,7 +203,7 @@ class DampedSine(Process):
     def step(
         self, key: jax.Array, state: SineState, signal: jax.Array
     ) -> tuple[jax.Array, SineState]:
-        """Add the wave, which is zero until its start."""
+        """Add the wave, which is zero before its start."""
         elapsed = jnp.maximum(state.time.astype(jnp.float32) - state.start, 0.0)
         cycles = elapsed / state.period
         offset = jnp.sum(state.amplitude * jnp.exp(-cycles) * jnp.sin(2.0 * jnp.pi * cycles))
@@ -221,7 +221,7 @@ class DampedSine(Process):
 
 
 def _validate_wave(process: Sine | DampedSine) -> None:
-    """Raise UserError unless amplitude, period and elements make sense."""
+    """Raise UserError unless amplitude, period and elements are valid."""
     require(process, "amplitude_min")
     require(process, "amplitude_max")
     require_ordered(process, "amplitude_min", "amplitude_max")
@@ -253,7 +253,7 @@ class GaussianNoise(Process):
 
 
 class Hidden(Process):
-    """``hidden``: one element is removed, the pendulum's angular velocity (paper, Section 5.2)."""
+    """``hidden``: removes an element, by default the angular velocity (paper, Section 5.2)."""
 
     element: int = struct.field(pytree_node=False, default=2)
 
@@ -268,7 +268,7 @@ class Hidden(Process):
         return jnp.concatenate([signal[: self.element], signal[self.element + 1 :]]), state
 
     def output_size(self, size: int) -> int:
-        """One less."""
+        """``size`` minus one."""
         check_elements(self, (self.element,), size)
         return size - 1
 

@@ -1,6 +1,6 @@
-"""Faults of sensors, actuators and the wires between them; they fit any signal [N].
+"""Faults of sensors, actuators and their connections; they fit any signal [N].
 
-The paper has none of these. Time is counted in environment steps. What a process remembers is
+The paper has none of these faults. Time is counted in environment steps. The state of a process is
 drawn or cleared at the start of every episode.
 """
 
@@ -16,10 +16,10 @@ from rtd3jax.errors import UserError
 
 
 class Dropout(Process):
-    """``dropout``: every step's signal is lost with probability ``p``, independently.
+    """``dropout``: the signal of a step is lost with probability ``p``, independently.
 
-    A lost signal is lost whole. In its place comes the last one that arrived (``hold``), zeros
-    before any has; or zeros always.
+    All elements of a signal are lost together. With ``hold``, the last signal that arrived replaces
+    a lost signal; before any has arrived, zeros do. Without ``hold``, zeros always replace it.
     """
 
     p: float = 0.1
@@ -27,13 +27,13 @@ class Dropout(Process):
     hold: bool = struct.field(pytree_node=False, default=True)
 
     def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> jax.Array:
-        """float32 [N], the last signal that arrived: none yet."""
+        """float32 [N], the last signal that arrived: zeros at first."""
         return jnp.zeros((size,), jnp.float32)
 
     def step(
         self, key: jax.Array, state: jax.Array, signal: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Let the signal through or not."""
+        """Pass the signal on, or replace it."""
         lost = jax.random.uniform(key, (), jnp.float32) < float32(self.p)
         shown = jnp.where(lost, state, signal)
         return shown, shown if self.hold else state
@@ -44,21 +44,21 @@ class Dropout(Process):
 
 
 class Delay(Process):
-    """``delay``, ``action-delay``: what comes out is what went in ``steps`` steps before.
+    """``delay``, ``action-delay``: the output is the input of ``steps`` steps before.
 
-    Zeros come out until the first signal is through: no measurement, or no command.
+    The output is zero until the first input arrives: no measurement, or no command.
     """
 
     steps: int = struct.field(pytree_node=False, default=2)
 
     def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> jax.Array:
-        """float32 [steps, N], the signals under way, the oldest first."""
+        """float32 [steps, N], the delayed signals, the oldest first."""
         return jnp.zeros((self.steps, size), jnp.float32)
 
     def step(
         self, key: jax.Array, state: jax.Array, signal: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Queue the signal; release the oldest."""
+        """Put the signal in the queue; return the oldest signal."""
         queue = jnp.concatenate([state, signal[None].astype(jnp.float32)])
         return queue[0], queue[1:]
 
@@ -84,7 +84,7 @@ class Quantisation(Process):
     def step(
         self, key: jax.Array, state: tuple[()], signal: jax.Array
     ) -> tuple[jax.Array, tuple[()]]:
-        """Round."""
+        """Round the signal."""
         resolution = jnp.broadcast_to(float32(self.resolution), signal.shape)
         return resolution * jnp.round(signal / resolution), state
 
@@ -94,10 +94,10 @@ class Quantisation(Process):
 
 
 class GainDrift(Process):
-    """``gain-drift``: every element is multiplied by a gain of its own, a clipped random walk.
+    """``gain-drift``: a gain multiplies each element; it is a clipped random walk.
 
     ``g_0 = 1`` and ``g' = clip(g + N(0, sigma^2), gain_min, gain_max)``; the gain of step t acts on
-    the signal of step t and then evolves. The gain has no unit, sigma is per step.
+    the signal of step t and then evolves. The gain has no unit; sigma is the deviation per step.
     """
 
     sigma: float = 0.02
@@ -105,7 +105,7 @@ class GainDrift(Process):
     gain_max: float = 1.5
 
     def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> jax.Array:
-        """float32 [N], the gains: one, or as near to it as the limits allow."""
+        """float32 [N], the gains: one, clipped to the limits."""
         return jnp.clip(
             jnp.ones((size,), jnp.float32), float32(self.gain_min), float32(self.gain_max)
         )
@@ -113,13 +113,13 @@ class GainDrift(Process):
     def step(
         self, key: jax.Array, state: jax.Array, signal: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Multiply, then drift."""
+        """Multiply the signal, then draw the next gains."""
         noise = float32(self.sigma) * jax.random.normal(key, state.shape, jnp.float32)
         evolved = jnp.clip(state + noise, float32(self.gain_min), float32(self.gain_max))
         return state * signal, evolved
 
     def validate(self) -> None:
-        """Check the walk and its limits."""
+        """Check the deviation and the limits of the gain."""
         require(self, "sigma", low=0)
         require(self, "gain_min")
         require(self, "gain_max")
@@ -127,9 +127,9 @@ class GainDrift(Process):
 
 
 class OrnsteinUhlenbeck(Process):
-    """``ornstein-uhlenbeck``: a bias that wanders about ``mean``, independent for each element.
+    """``ornstein-uhlenbeck``: a random bias around ``mean``, independent for each element.
 
-    Stationary from the first step on, with standard deviation ``sigma`` (the signal's units) and
+    The bias is stationary, with standard deviation ``sigma`` (in the signal's units) and
     autocorrelation ``exp(-k / time_constant)`` at a lag of k steps: the exact discretisation of
     Uhlenbeck & Ornstein's process (Physical Review 36, 1930).
     """
@@ -139,7 +139,7 @@ class OrnsteinUhlenbeck(Process):
     """Steps after which a deviation has fallen to 1/e."""
     mean: float = 0.0
     elements: tuple[int, ...] = struct.field(pytree_node=False, default=())
-    """Those that are disturbed; () means all."""
+    """Indices of the disturbed elements; () means all."""
 
     def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> jax.Array:
         """float32 [N], the bias, drawn from its stationary distribution."""
@@ -149,7 +149,7 @@ class OrnsteinUhlenbeck(Process):
     def step(
         self, key: jax.Array, state: jax.Array, signal: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Add the bias, then let it wander."""
+        """Add the bias, then draw the next bias."""
         mean = float32(self.mean)
         decay = jnp.exp(-1.0 / float32(self.time_constant))
         spread = float32(self.sigma) * jnp.sqrt(1.0 - decay**2)
@@ -165,7 +165,7 @@ class OrnsteinUhlenbeck(Process):
         return size
 
     def validate(self) -> None:
-        """Check the spread and the time constant."""
+        """Check the standard deviation and the time constant."""
         require(self, "sigma", low=0)
         require(self, "time_constant", above=0)
         require(self, "mean")

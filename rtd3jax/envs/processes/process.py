@@ -1,7 +1,7 @@
-"""Hidden processes: what changes a signal from step to step, drawn anew every episode.
+"""Hidden processes: they change a signal from step to step, and are drawn in every episode.
 
-A process is a pytree. Its numeric parameters are leaves, so a program is compiled once for all of
-their values and can be vmapped over them; its structural choices are static.
+A process is a pytree. Its numeric parameters are leaves: one compiled program serves all of their
+values, and can be vmapped over them. Its structural options are static.
 """
 
 from typing import Any
@@ -16,32 +16,32 @@ from rtd3jax.errors import UserError
 
 
 class Process(struct.PyTreeNode):
-    """Base of every process. ``signal`` is a float vector, [O] observations or [2] wheel speeds."""
+    """Base of every process. A signal is a float vector, such as an observation [O]."""
 
     def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> Any:
-        """Draw the state of an episode of ``horizon`` steps (may be traced), signals [size]."""
+        """Draw the state for an episode of ``horizon`` steps (may be traced) and signals [size]."""
         raise NotImplementedError
 
     def step(self, key: jax.Array, state: Any, signal: jax.Array) -> tuple[jax.Array, Any]:
-        """Return what becomes of this step's signal, and the state of the next step."""
+        """The changed signal of this step, and the state for the next step."""
         raise NotImplementedError
 
     def output_size(self, size: int) -> int:
-        """Elements that leave for ``size`` that enter; raises UserError if they do not fit."""
+        """Elements of the output for an input of ``size``; UserError if ``size`` does not fit."""
         return size
 
     def validate(self) -> None:
-        """Raise UserError, naming the parameter, if a concrete parameter makes no sense."""
+        """Raise UserError, naming the parameter, if a parameter that is not traced is invalid."""
 
     def check_use(self, horizon: int, field: str) -> None:
-        """Raise UserError if it cannot act throughout an episode of ``horizon`` steps.
+        """Raise UserError if the process cannot act in a whole episode of ``horizon`` steps.
 
-        ``field`` names what it acts on: the field of the environment's parameters that holds it.
+        ``field`` is the name of the environment's parameter that holds the process.
         """
 
 
 class NoDisturbance(Process):
-    """Leaves the signal as it is."""
+    """A process that does not change the signal."""
 
     def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> tuple[()]:
         """No state."""
@@ -55,11 +55,11 @@ class NoDisturbance(Process):
 
 
 Nothing = NoDisturbance
-"""The name of earlier versions."""
+"""The name of `NoDisturbance` in earlier versions."""
 
 
 class Chain(Process):
-    """Several processes in sequence, the first acting first, each with its own random stream."""
+    """Several processes in sequence, each with its own random stream."""
 
     processes: tuple[Process, ...] = ()
 
@@ -97,10 +97,10 @@ class Chain(Process):
 
 
 class Sum(Process):
-    """Several processes side by side: each sees the clean signal, and what they add is added up.
+    """Several processes in parallel: each reads the clean signal, and their offsets are added.
 
-    Each has its own random stream. In a `Chain` a later member sees what the earlier ones made of
-    the signal; here none sees another's work, and their order does not matter.
+    Each process has its own random stream. In a `Chain`, a process reads the output of the previous
+    one; here, no process reads the output of another, so their order does not matter.
     """
 
     processes: tuple[Process, ...] = ()
@@ -122,12 +122,12 @@ class Sum(Process):
         return total, tuple(states)
 
     def output_size(self, size: int) -> int:
-        """Unchanged; UserError for a member that adds or removes elements."""
+        """Unchanged; raises UserError for a member that adds or removes elements."""
         for process in self.processes:
             if process.output_size(size) != size:
                 raise UserError(
-                    f"Sum: {type(process).__name__} changes the number of elements, so that what "
-                    "it adds is not defined; put it into a Chain"
+                    f"Sum: {type(process).__name__} changes the number of elements, so its offset "
+                    "is not defined; use a Chain"
                 )
         return size
 
@@ -143,10 +143,10 @@ class Sum(Process):
 
 
 def check_uses(params: object, unlimited: int) -> None:
-    """Raise UserError if a process anywhere in an environment's parameters cannot act there.
+    """Raise UserError if a process in an environment's parameters cannot act in its episodes.
 
-    ``unlimited`` steps are an episode's where the parameters name no time limit; a traced limit is
-    not known yet.
+    ``unlimited`` is the length of an episode if the parameters have no time limit. A traced limit
+    is not checked.
     """
     horizon = getattr(params, "max_steps_in_episode", unlimited)
     if isinstance(horizon, jax.core.Tracer) or np.ndim(horizon):
@@ -158,7 +158,7 @@ def check_uses(params: object, unlimited: int) -> None:
 
 
 def float32(value: ArrayLike) -> jax.Array:
-    """A parameter as a strong float32 array, whatever kind of number it was given as."""
+    """A parameter as a strongly typed float32 array, for any type of number."""
     return jnp.asarray(value, jnp.float32)
 
 
@@ -167,7 +167,7 @@ def require(
 ) -> None:
     """Raise UserError unless field ``name`` is finite, in [low, high] and greater than ``above``.
 
-    Traced values are let through: they are not known yet.
+    Traced values are not checked.
     """
     value = getattr(process, name)
     if isinstance(value, jax.core.Tracer):

@@ -1,4 +1,4 @@
-"""Recorded disturbances, played as they were measured."""
+"""Disturbances that replay a recording."""
 
 import hashlib
 from collections.abc import Sequence
@@ -20,39 +20,40 @@ _PARAMETERS = (
 )
 PLAYED_ON = ("observation", "action", "reward", "slip")
 MOST_ROWS = 2**31 - 1
-"""Rows are counted by int32."""
+"""Rows of all recordings, at most: rows are counted with int32."""
 
 
 class RecordedState(struct.PyTreeNode):
-    """Where in the recording each element is; N elements."""
+    """Position of each of the N elements in the recordings."""
 
     value: jax.Array
-    """float32 [N], what the next signal meets"""
+    """float32 [N], the values that act on the next signal"""
     time: jax.Array
     """int32 []: step of the episode"""
     begin: jax.Array
-    """int32 [N]: row at which the recorded episode begins"""
+    """int32 [N]: first row of the chosen recording"""
     length: jax.Array
-    """int32 [N]: rows of it"""
+    """int32 [N]: number of its rows"""
     start: jax.Array
-    """int32 [N]: the row of it that was played first"""
+    """int32 [N]: row of the recording at which the episode starts"""
 
     @property
     def slip(self) -> jax.Array:
-        """float32 [N], by the name under which the rover's pictures look for it."""
+        """float32 [N], the current values, under the name that the rover's pictures read."""
         return self.value
 
 
 class Recorded(Process):
-    """Plays recorded sequences: in each episode a random stretch of a random recording.
+    """Replays recordings: in each episode, a random part of a random recording.
 
-    Every row from which a whole episode of the environment fits into its recording is equally
-    likely to be the first. The elements are played together, from the same row, unless they are
-    ``independent``. What is played is added to the signal; ``channel="slip"`` makes of the signal
-    ``(1 - value)`` times the signal, as the slip of the rover's wheels does.
+    Every row after which a whole episode fits into the recording is equally likely to be the first
+    row. All elements are replayed from the same row, unless they are ``independent``. The values
+    are added to the signal; with ``channel="slip"``, the output is ``(1 - value)`` times the
+    signal, as for the slip of the rover's wheels.
 
     The numbers are leaves: recordings of equal shapes share one compiled program, and lanes of one
-    program may play different recordings. Equal recordings are equal, and have equal hashes.
+    program may replay different recordings. Instances with equal values and options are equal, and
+    have equal hashes.
     """
 
     values: Any
@@ -60,14 +61,14 @@ class Recorded(Process):
     begins: Any
     """int32 [E]: the first row of each of E recordings"""
     lengths: Any
-    """int32 [E]: their rows"""
+    """int32 [E]: the number of rows of each recording"""
     low: Any
-    """float32 [] or [N]: what is less is played as this"""
+    """float32 [] or [N]: lower bound, to which values are clipped"""
     high: Any
-    """float32 [] or [N]: what is more is played as this"""
+    """float32 [] or [N]: upper bound, to which values are clipped"""
     channel: str = struct.field(pytree_node=False)
     elements: tuple[int, ...] = struct.field(pytree_node=False)
-    """Those of the signal that are disturbed, one for each column; () means all."""
+    """Indices of the disturbed elements of the signal, one for each column; () means all."""
     independent: bool = struct.field(pytree_node=False)
     mirror: bool = struct.field(pytree_node=False)
 
@@ -90,25 +91,27 @@ class Recorded(Process):
 
         Args:
             log: a CSV or Parquet file, a pandas table, an array [T], [T, N] or [E, T, N], or a list
-                of arrays [T, N]. A row with NaN is a gap: before and after it are two recordings.
-            channel: what was recorded: an offset of the "observation", the "action" or the
-                "reward", in its unit, or the "slip" of wheels, as a share of their speed.
-            columns: of a file or table; all but the episode's by default. See
-                `rtd3jax.envs.log.read_log`, for the next three too.
-            episode: the column that numbers the episodes; "episode" by default, where there is one.
+                of arrays [T, N]. A row with NaN is a gap, which separates two recordings.
+            channel: the recorded quantity: an offset of the "observation", the "action" or the
+                "reward", in its unit, or the "slip" of wheels, as a fraction of their speed.
+            columns: columns of a file or table; all except the episode's by default. See
+                `rtd3jax.envs.log.read_log` for this and the next three arguments.
+            episode: the column that numbers the episodes; "episode" by default, if there is one.
             period: time in s between two samples of the log.
             step: time in s between two steps of the environment; the log is interpolated linearly.
-            bounds: (low, high) of what is played, numbers or arrays [N]; none by default.
-            elements: of the signal that are disturbed, one for each column; () means all.
-            independent: draw a recording and a start for each element by itself. That makes more
-                of a short log, and loses what the elements have in common.
-            mirror: let a recording that is shorter than an episode be played to its end, then
-                backwards, and so on. Without it such recordings are never played, and a log that
-                has no longer one is refused.
-            **fields: the fields of a recording that was read before; `replace` gives them.
+            bounds: (low, high), to which the values are clipped, numbers or arrays [N]; none by
+                default.
+            elements: indices of the disturbed elements of the signal, one for each column; () means
+                all.
+            independent: draw a recording and a start separately for each element. A short log then
+                gives more different episodes, but the elements are no longer correlated.
+            mirror: replay a recording that is shorter than an episode to its end, then backwards,
+                and so on. Without this option, short recordings are never replayed, and a log with
+                only short recordings is refused.
+            **fields: the fields of an existing instance; `replace` passes them.
 
         Raises:
-            UserError: for a log that cannot be read or played.
+            UserError: for a log that cannot be read or replayed.
         """
         if fields:
             if log is not None or set(fields) != {"values", "begins", "lengths", "low", "high"}:
@@ -134,7 +137,7 @@ class Recorded(Process):
             self.validate()
 
     def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> RecordedState:
-        """Draw which recording is played, and from where."""
+        """Draw the recording and the row at which the episode starts."""
         self.output_size(size)
         count = self.values.shape[-1]
         draws = count if self.independent else 1
@@ -154,18 +157,18 @@ class Recorded(Process):
         return state.replace(value=self._value(state))
 
     def _starts(self, lengths: jax.Array, horizon: jax.Array) -> jax.Array:
-        """Rows [E] of each recording at which an episode may begin."""
+        """Number of rows [E] of each recording at which an episode may start."""
         fitting = jnp.maximum(lengths - (self._needed(horizon) - 1), 0)
-        # Where the horizon is traced, nobody could refuse an episode that is too long: it mirrors.
+        # With a traced horizon, nothing has refused an episode that is too long: it is mirrored.
         anywhere = self.mirror | ~jnp.any(fitting > 0)
         return jnp.where(anywhere & (fitting == 0), lengths, fitting)
 
     def _needed(self, horizon: Any) -> Any:
-        """Signals in an episode: an observation is seen before its first step too."""
+        """Signals in an episode; there is also an observation before the first step."""
         return horizon + (1 if self.channel == "observation" else 0)
 
     def _value(self, state: RecordedState) -> jax.Array:
-        """What is played at the state's time, [N]; past the end the recording runs backwards."""
+        """The values [N] at the state's time; after the end, the recording runs backwards."""
         turn = jnp.maximum(2 * (state.length - 1), 1)
         row = (state.start + state.time) % turn
         row = state.begin + jnp.where(row < state.length, row, turn - row)
@@ -180,7 +183,7 @@ class Recorded(Process):
     def step(
         self, key: jax.Array, state: RecordedState, signal: jax.Array
     ) -> tuple[jax.Array, RecordedState]:
-        """Play a row, then go on to the next."""
+        """Apply the values of a row, then go to the next row."""
         value = state.value
         if self.elements:
             everything = jnp.zeros(signal.shape, jnp.float32)
@@ -190,23 +193,23 @@ class Recorded(Process):
         return signal, state.replace(value=self._value(state))
 
     def output_size(self, size: int) -> int:
-        """Unchanged; UserError unless there is a column for each element that is disturbed."""
+        """Unchanged; UserError unless there is a column for each disturbed element."""
         count = self.values.shape[-1]
         if self.elements:
             check_elements(self, self.elements, size)
         elif count != size:
             raise UserError(
                 f"Recorded: the recording has {count} element{'s' * (count != 1)} and the "
-                f"{self.channel} {size}; choose columns, or say which elements=(...) are disturbed"
+                f"{self.channel} {size}; choose columns, or pass elements=(...)"
             )
         return size
 
     def check_use(self, horizon: int, field: str) -> None:
-        """Raise UserError unless this was recorded there, and some recording is long enough."""
+        """Raise UserError unless the channel agrees and some recording is long enough."""
         if field in PLAYED_ON and self.channel not in (field, "slip"):
             raise UserError(
-                f"Recorded: this recording is of the {self.channel}, and is to act on the {field}; "
-                f"say channel={field!r} where it is read"
+                f"Recorded: a recording of the {self.channel} cannot act on the {field}; "
+                f"pass channel={field!r} when you read the log"
             )
         if self.mirror or isinstance(self.lengths, jax.core.Tracer):
             return
@@ -214,8 +217,8 @@ class Recorded(Process):
         if longest < needed:
             raise UserError(
                 f"Recorded: the longest recording without a gap has {longest:,} rows, and an "
-                f"episode needs {needed:,}; lower max_steps_in_episode, or let recordings be "
-                "played back and forth by mirror=True"
+                f"episode needs {needed:,}; lower max_steps_in_episode, or pass mirror=True to "
+                "replay recordings forwards and backwards"
             )
 
     def validate(self) -> None:
@@ -232,7 +235,7 @@ class Recorded(Process):
         for name in ("low", "high"):
             require(self, name)
             if np.ndim(getattr(self, name)) and np.shape(getattr(self, name)) != (count,):
-                raise UserError(f"Recorded: bounds are one number each, or {count} for each column")
+                raise UserError(f"Recorded: each bound must be one number or {count} numbers")
         require_ordered(self, "low", "high")
         if self.elements:
             whole = isinstance(self.elements, tuple) and all(
@@ -244,30 +247,30 @@ class Recorded(Process):
             if len(self.elements) != count:
                 raise UserError(
                     f"Recorded: {len(self.elements)} elements for a recording of {count} columns; "
-                    "give one for each"
+                    "pass one for each"
                 )
         if self.channel == "slip" and not isinstance(self.values, jax.core.Tracer):
             played = np.clip(self.values, self.low, self.high)
             if np.min(played) < -1.0 or np.max(played) > 1.0:
                 raise UserError(
-                    f"Recorded: slip is a share of the speed, and the recording goes from "
+                    f"Recorded: slip is a fraction of the speed, but the recording goes from "
                     f"{np.min(played):.3g} to {np.max(played):.3g}; divide it by the commanded "
-                    "speed, or give bounds=(0, 1)"
+                    "speed, or pass bounds=(0, 1)"
                 )
 
     def sequences(self) -> list[np.ndarray]:
-        """The recordings, as they are played but for the bounds: float32 [T, N] each."""
+        """The recordings before they are clipped to the bounds: float32 [T, N] each."""
         values = np.asarray(self.values)
         return [values[b : b + n] for b, n in zip(self.begins, self.lengths, strict=True)]
 
     def split(self, fraction: float = 0.8) -> tuple["Recorded", "Recorded"]:
-        """The first ``fraction`` of the rows, to train on, and the rest, to test on.
+        """Split into the first ``fraction`` of the rows, for training, and the rest, for tests.
 
-        Several recordings are shared out whole, in their order, so that no recording is on both
-        sides; the cut lies where it comes nearest to ``fraction``. A single one is cut in time.
+        With several recordings, the split lies between two of them, as near to ``fraction`` as
+        possible, so no recording is on both sides. A single recording is split in time.
 
         Raises:
-            UserError: where one of the sides would be empty.
+            UserError: if one of the sides would be empty.
         """
         number = isinstance(fraction, float | int | np.number) and not isinstance(fraction, bool)
         if not number or not 0.0 < fraction < 1.0:
@@ -281,7 +284,7 @@ class Recorded(Process):
         else:
             cut = round(fraction * rows)
             if not 0 < cut < rows:
-                raise UserError(f"split: {rows} rows cannot be cut at {fraction:g} of them")
+                raise UserError(f"split: {rows} rows cannot be split at {fraction:g} of them")
             sides = [parts[0][:cut]], [parts[0][cut:]]
         first, second = (self.replace(**_leaves(side)) for side in sides)
         return first, second
@@ -300,17 +303,17 @@ class Recorded(Process):
         return (digest, shapes, self.channel, self.elements, self.independent, self.mirror)
 
     def __eq__(self, other: object) -> bool:
-        """Whether both play the same numbers in the same way."""
+        """Whether both have the same numbers and the same options."""
         if type(other) is not type(self):
             return NotImplemented
         return self._digest() == other._digest()
 
     def __hash__(self) -> int:
-        """Of the numbers and of how they are played."""
+        """Hash of the numbers and the options."""
         return hash(self._digest())
 
     def __repr__(self) -> str:
-        """What it is of, without its numbers."""
+        """A summary without the numbers."""
         if not all(hasattr(leaf, "shape") for leaf in (self.values, self.lengths)):
             return f"Recorded({self.values!r})"
         return (
@@ -320,11 +323,11 @@ class Recorded(Process):
 
 
 def _leaves(stretches: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
-    """The arrays of `Recorded` for these stretches [T, N]."""
+    """The arrays of `Recorded` for these sequences [T, N]."""
     lengths = np.array([len(part) for part in stretches], np.int32)
     total = sum(map(len, stretches))
     if total > MOST_ROWS:
-        raise UserError(f"Recorded: {total:,} rows are more than int32 can count; thin the log")
+        raise UserError(f"Recorded: {total:,} rows are more than int32 can count; shorten the log")
     begins = np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int32)
     return {
         "values": np.concatenate(stretches).astype(np.float32),
@@ -334,7 +337,7 @@ def _leaves(stretches: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _bounds(bounds: tuple[Any, Any] | None) -> tuple[np.ndarray, np.ndarray]:
-    """Low and high as float32; the whole of float32 where there are none."""
+    """Low and high as float32; the limits of float32 if there are no bounds."""
     if bounds is None:
         most = np.finfo(np.float32).max
         bounds = (-most, most)
@@ -342,6 +345,6 @@ def _bounds(bounds: tuple[Any, Any] | None) -> tuple[np.ndarray, np.ndarray]:
         low, high = (np.asarray(bound, np.float32) for bound in bounds)
     except (TypeError, ValueError):
         raise UserError(
-            f"Recorded: bounds={bounds!r} must be (low, high), numbers or one for each column"
+            f"Recorded: bounds={bounds!r} must be (low, high), each a number or one for each column"
         ) from None
     return low, high

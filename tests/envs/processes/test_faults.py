@@ -288,7 +288,10 @@ def test_names_are_joined_and_parameters_find_their_owner():
         (lambda: make("pendulum", "dropuot"), "did you mean 'dropout'"),
         (lambda: make("pendulum", "dropout", p=1.5), "p=1.5"),
         (lambda: make("pendulum", "delay", steps=0.5), "steps"),
-        (lambda: make("pendulum", "delay+action-delay", steps=1), "'steps' is a parameter of delay and"),
+        (
+            lambda: make("pendulum", "delay+action-delay", steps=1),
+            "'steps' is a parameter of delay and",
+        ),
         (lambda: make("rover", "dropout+noise"), "unknown disturbance 'noise'"),
         (lambda: make("rover", "ornstein-uhlenbeck", elements=(2,)), "element 2"),
         (lambda: disturb(Echo(), Delay(steps=1.5)), "whole number"),

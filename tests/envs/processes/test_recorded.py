@@ -142,7 +142,7 @@ def test_a_split_shares_out_whole_recordings():
         ({"channel": "slip"}, "goes from 0 to 11.2; divide it by the commanded speed"),
         ({"bounds": (1.0, 0.0)}, "low=1.0 is greater than high=0.0"),
         ({"bounds": 3.0}, "must be \\(low, high\\)"),
-        ({"bounds": ([0.0] * 3, 1.0)}, "one number each, or 2"),
+        ({"bounds": ([0.0] * 3, 1.0)}, "one number or 2 numbers"),
         ({"bounds": (0.0, float("nan"))}, "not finite"),
         ({"elements": (0,)}, "1 elements for a recording of 2 columns"),
         ({"elements": (0, 0)}, "distinct"),
@@ -163,9 +163,9 @@ def test_a_recording_that_does_not_fit_is_refused_before_compilation():
         rtd.Recorded()
     wide = rtd.Recorded(numbered(20, columns=3))
     offset = rtd.Recorded(numbered(20))
-    with pytest.raises(UserError, match="of the observation, and is to act on the slip"):
+    with pytest.raises(UserError, match="recording of the observation cannot act on the slip"):
         rtd.evaluate(COMMAND, Rover(RoverParams(slip=offset, max_steps_in_episode=STEPS)))
-    with pytest.raises(UserError, match="of the observation, and is to act on the action"):
+    with pytest.raises(UserError, match="recording of the observation cannot act on the action"):
         rtd.evaluate(COMMAND, rtd.disturb(Rover(), offset, "action"))
     env = Rover(RoverParams(max_steps_in_episode=STEPS))
     with pytest.raises(UserError, match="has 3 elements and the observation 2"):
