@@ -1,1 +1,1 @@
-"""One learner, pure functions over one lane."""
+"""Agents: networks, memories, learners and replay, as pure functions of one lane's arrays."""

@@ -1,4 +1,4 @@
-"""`Agent`: networks, learner and what replay keeps for them, bound once for a configuration.
+"""`Agent`: networks, learner and replay of one configuration.
 
 Actions are in half ranges. Shapes: ``B`` batch, ``O`` and ``A`` sizes of an observation and an
 action.
@@ -32,7 +32,7 @@ from rtd3jax.registries import AGENTS, LEARNERS, MEMORIES
 
 
 class Sizes(Protocol):
-    """What an agent must know of an environment, such as its `rtd3jax.envs.interface.Interface`."""
+    """Sizes of an environment, such as those of `rtd3jax.envs.interface.Interface`."""
 
     @property
     def observation_size(self) -> int:
@@ -45,13 +45,13 @@ class Sizes(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class Agent:
-    """Pure functions over one lane's arrays.
+    """An agent as pure functions of one lane's arrays.
 
     Attributes:
-        variant: what the agent is.
-        networks: actor and critic, with wide products in the configuration's precision.
-        acting: the actor in float32, as policies have it.
-        learner: what trains them.
+        variant: the definition of the agent.
+        networks: actor and critic for updates, in the configuration's precision.
+        acting: the actor in float32, for acting and for policies.
+        learner: the learner that trains the networks.
         config: the configuration.
         observation_size: O.
         action_size: A.
@@ -67,31 +67,31 @@ class Agent:
 
     @property
     def metrics(self) -> tuple[str, ...]:
-        """Names of what `update` measures."""
+        """Names of the quantities that `update` measures."""
         return self.learner.metrics
 
     @property
     def has_running_carry(self) -> bool:
-        """Whether it acts with a carry that runs on from the episode's start, without a window."""
+        """Whether the agent acts with a carry from the start of the episode, not with a window."""
         return self.config.runs_on
 
     @property
     def acting_tokens(self) -> int:
-        """Past tokens in the arrays of the window that it acts upon."""
+        """Past tokens in the arrays of the window with which the agent acts."""
         return 0 if self.has_running_carry else self.config.window_tokens
 
     def init(self, key: jax.Array) -> Any:
-        """The learner's state at the start; its ``actor`` is the actor's parameters."""
+        """The initial state of the learner; its field ``actor`` holds the actor's parameters."""
         return self.learner.init(key, self.networks)
 
     @property
     def stores_carry(self) -> bool:
-        """Whether replay keeps the behaviour actor's carries: for the critics, or for segments."""
+        """Whether the replay stores the actor's carries, for the critics or for segments."""
         from_carries = self.has_running_carry and self.config.replay == "segments"
         return self.variant.stores_carry or from_carries
 
     def empty_replay(self) -> Replay:
-        """The ring in which the agent's transitions are kept."""
+        """An empty ring buffer for the agent's transitions."""
         carry = self.acting.zero_carry(1) if self.stores_carry else None
         return empty_replay(
             self.config.capacity,
@@ -102,22 +102,22 @@ class Agent:
         )
 
     def zero_carry(self) -> Carry | None:
-        """The running carries, leaves [K, ...], before episodes' first steps; None with windows."""
+        """The running carries, leaves [K, ...], at the start of episodes; None with windows."""
         return self.acting.zero_carry(self.config.environments) if self.has_running_carry else None
 
     def no_statistics(self) -> Statistics | None:
-        """Those of no observation yet; None where networks read observations as they are."""
+        """Statistics of zero observations; None without normalisation of observations."""
         return no_statistics(self.observation_size) if self.config.normalise_observations else None
 
     def act(
         self, actor: Params, window: Window, running: Carry | None
     ) -> tuple[jax.Array, Carry | None]:
-        """The deterministic action [B, A], and the carry that replay keeps, if it does.
+        """The deterministic action [B, A], and the carry that the replay stores, or None.
 
         Args:
-            actor: its parameters.
-            window: of the step; without past tokens where a carry runs on.
-            running: that carry, before the step; None with windows.
+            actor: the actor's parameters.
+            window: the window of the step; it has no past tokens with a running carry.
+            running: the running carry before the step; None with windows.
         """
         carry = running
         if carry is None and self.variant.stores_carry:
@@ -128,7 +128,7 @@ class Agent:
     def carry_after(
         self, actor: Params, window: Window, action: jax.Array, running: Carry | None
     ) -> Carry | None:
-        """The running carry after a step at which ``action`` [B, A] was done; None with windows."""
+        """The running carry after a step with ``action`` [B, A]; None with windows."""
         if running is None:
             return None
         return advance(self.acting, actor, window, action, running)
@@ -142,9 +142,9 @@ class Agent:
         history_length: jax.Array,
         running: Carry | None,
     ) -> Carry:
-        """The carry before an episode's final observation [B, O], after ``action`` [B, A].
+        """The carry before the final observation [B, O] of an episode, after ``action`` [B, A].
 
-        That is ``running``, as `carry_after` gave it, where a carry runs on.
+        With a running carry, it is ``running``, which `carry_after` returned.
         """
         if running is not None:
             return running
@@ -159,7 +159,7 @@ class Agent:
         history_length: jax.Array,
         normaliser: Normaliser | None,
     ) -> Batch:
-        """A batch of the ``count`` steps written so far, as networks read them."""
+        """A batch from the ``count`` steps written so far, with normalised observations."""
         batch = self._sample(replay, key, count, history_length)
         return dataclasses.replace(
             batch,
@@ -190,7 +190,7 @@ class Agent:
         hyperparameters: Hyperparameters,
         count: jax.Array,
     ) -> tuple[Any, Metrics]:
-        """The ``count``-th update (int32 [], from 1); ``keys`` [2] are consumed here."""
+        """The update number ``count`` (int32 [], from 1); it consumes ``keys`` [2]."""
         new, metrics = self.learner.update(
             self.networks, state, batch, keys, hyperparameters, count
         )
@@ -201,7 +201,7 @@ def make_agent(config: Config, interface: Sizes) -> Agent:
     """The agent of ``config`` for environments of ``interface``.
 
     Raises:
-        UserError: when the agent, its memory or its learner is unknown, or does not keep to its
+        UserError: when the agent, its memory or its learner is unknown, or violates its
             interface.
     """
     variant: Variant = AGENTS[config.algorithm]
@@ -235,14 +235,14 @@ def make_part(
 
     Args:
         variant: the agent.
-        role: which of the two.
-        memory: the name of its recurrent cell.
+        role: ``actor`` or ``critic``.
+        memory: the name of the recurrent cell.
         observation_size: O.
         action_size: A.
-        width: of every layer.
-        precision: of the factors of wide products.
+        width: width H of every layer.
+        precision: precision of the factors of large products.
     """
-    # The class stands in the key, so that a memory that replaced another is seen.
+    # The class is part of the key, so that a memory that replaced another takes effect.
     sizes = observation_size, action_size, width
     return _part(variant, role, memory, MEMORIES[memory], *sizes, precision)
 
@@ -254,7 +254,7 @@ def count_parameters(
     hidden_size: int = 128,
     memory: str = "lstm",
 ) -> dict[str, int]:
-    """Numbers of parameters of one actor and one critic, counted from initialised ones.
+    """Numbers of parameters of one actor and one critic, counted from initialised networks.
 
     ``count_parameters("lstm-td3", obs_dim=3, act_dim=1)`` gives the paper's Table 5.
     """

@@ -1,4 +1,4 @@
-"""The border between actions in half ranges, an agent's, and those in an environment's units."""
+"""Converts an agent's actions, in half ranges, to the environment's units."""
 
 import jax
 import jax.numpy as jnp
@@ -7,14 +7,14 @@ from flax import struct
 
 @struct.dataclass
 class Bounds:
-    """The range of the environment's action, in its own units. ``low`` and ``high``: [A]."""
+    """The range of the environment's action in its units. ``low`` and ``high``: [A]."""
 
     low: jax.Array
     high: jax.Array
 
     @property
     def half_range(self) -> jax.Array:
-        """Half the distance between the bounds: [A]; the unit in which agents act."""
+        """Half the distance between the bounds: [A]; the unit of the agent's actions."""
         return 0.5 * self.high - 0.5 * self.low
 
     @property
@@ -23,8 +23,8 @@ class Bounds:
         return 0.5 * self.high + 0.5 * self.low
 
     def to_environment(self, action: jax.Array) -> jax.Array:
-        """An agent's ``action`` [A], in half ranges about the centre, in the environment's units.
+        """Convert ``action`` [A], in half ranges from the centre, to the environment's units.
 
-        It is within the bounds, also where the sum is rounded.
+        The result lies within the bounds, even if rounding would exceed them.
         """
         return jnp.clip(self.centre + self.half_range * action, self.low, self.high)

@@ -1,4 +1,4 @@
-"""Parts of the networks whose weights stay as they began, such as ``actor.memory``."""
+"""Parts of the networks that are not trained, such as ``actor.memory``."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -9,14 +9,14 @@ from rtd3jax.agents.networks import LAYERS, Network
 from rtd3jax.errors import UserError, nearest
 
 State = TypeVar("State")
-"""What a learner keeps: a dataclass of networks, optimisers and the like."""
+"""The state of a learner: a dataclass with networks and optimisers."""
 
 Weights = Params | tuple[Params, ...]
-"""Of one network, or of several alike."""
+"""The weights of one network, or of several networks of the same kind."""
 
 
 def check_parts(parts: Sequence[str], networks: Mapping[str, Network]) -> None:
-    """Raise UserError where a part names no network of ``networks``, or no layer of one."""
+    """Raise UserError if a part does not name a network of ``networks`` or one of its layers."""
     for part in parts:
         whose, _, layer = part.partition(".")
         layers = [n for n in LAYERS if getattr(networks[whose], n, None) is not None]
@@ -28,7 +28,7 @@ def check_parts(parts: Sequence[str], networks: Mapping[str, Network]) -> None:
 
 
 def frozen_parts(before: State, after: State, parts: Sequence[str]) -> State:
-    """The learner's state ``after`` an update, with ``parts`` as they were ``before`` it."""
+    """The state ``after`` an update, in which ``parts`` keep their values ``before`` it."""
     if not parts:
         return after
     kept: dict[str, Weights] = {}

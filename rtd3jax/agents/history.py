@@ -1,12 +1,13 @@
-"""Histories: the tokens that an agent may read, cut from a ring of steps (paper, Section 5.1).
+"""Histories: the past tokens of an agent, read from a ring buffer (paper, Section 5.1).
 
-A lane may have several environments, K of them, which act side by side: step s of environment e is
-step number ``s K + e``, so that the step before it is K numbers earlier.
+A lane may have K environments that step together. Step s of environment e has the number
+``s K + e``, so the number of the previous step is smaller by K.
 
-One function, `window_at`, serves acting, replay, evaluation and deployment. Its invariant: the
-tokens that exist are the last of the window. What is before an episode's first step, before the
-oldest step kept, or beyond the history length does not exist; it is not a zero token. `segment_at`
-cuts a stretch of steps instead, whose tokens are read once for all of them.
+The same function, `window_at`, is used for acting, replay, evaluation and deployment. Its
+invariant: the existing tokens are the last tokens of the window. A token does not exist if it is
+before the first step of the episode, older than the oldest step in the ring, or beyond the history
+length; it is not a token of zeros. `segment_at` reads consecutive steps, whose tokens are computed
+once for all of them.
 
 Shapes: ``C`` capacity of the ring, ``L`` past tokens, ``B`` batch, ``M`` segments of ``m`` steps,
 ``O`` and ``A`` sizes of an observation and an action.
@@ -21,12 +22,12 @@ from flax import struct
 
 @struct.dataclass
 class Steps:
-    """A ring of steps; step number n of a lane stands in slot ``n % C``.
+    """A ring buffer of steps; step number n of a lane is in slot ``n % C``.
 
     Attributes:
-        observation: [C, O], what the agent saw at the step.
-        previous_action: [C, A], the action before it; zero at an episode's first step.
-        action: [C, A], what it did.
+        observation: [C, O], the observation of the step.
+        previous_action: [C, A], the previous action; zero at the first step of an episode.
+        action: [C, A], the action of the step.
     """
 
     observation: jax.Array
@@ -36,11 +37,11 @@ class Steps:
 
 @struct.dataclass
 class Window:
-    """What a network may read at one step of each of B episodes, besides the current action.
+    """The inputs of a network, except the current action, at one step of each of B episodes.
 
     Attributes:
         past: steps, leaves [L, B, ...], oldest first.
-        length: int32 [B], how many of the past tokens exist; they are the last ones.
+        length: int32 [B], the number of existing past tokens, which are the last ones.
         observation: [B, O], the current observation.
         previous_action: [B, A], the action before it; zero at an episode's first step.
     """
@@ -59,23 +60,23 @@ class Window:
 
 @struct.dataclass
 class Segment:
-    """What a network may read at m consecutive steps in each of M places: B = M m steps.
+    """The inputs of a network at m consecutive steps in each of M places: B = M m steps.
 
-    Every token serves all the steps after it, where a window has tokens for one step alone. The
-    steps [m, M] lie flat, one place after the other within a step's number.
+    All later steps share the tokens of earlier steps, whereas a window has separate tokens for each
+    step. The steps [m, M] are flattened to [B]; the place is the fastest index.
 
     Attributes:
         steps: leaves [T, M, ...], T = L + m: the burn-in, then the m steps themselves.
-        starts: bool [T, M], tokens before which there is no history: an episode's first, the oldest
-            step kept, and the first that the history length lets in.
+        starts: bool [T, M], tokens before which there is no history: the first step of an episode,
+            the oldest step in the ring, and the first step within the history length.
         observation: [B, O], the current observation.
         previous_action: [B, A], the action before it; zero at an episode's first step.
-        begins: bool [M], whether the burn-in's first token is an episode's first.
-        start: the behaviour actor's carry before the burn-in's first token, leaves [M, ...], from
-            which an actor goes on that acts with a running carry (Kapturowski et al., 2019, have
-            both a stored state and a burn-in); None where histories begin with nothing.
-        following: whether the current step is the one after each of the m steps.
-        burn_in_gradient: whether a gradient flows back into the burn-in.
+        begins: bool [M], whether the first token of the burn-in is the first of an episode.
+        start: the behaviour actor's carry before the first token of the burn-in, leaves [M, ...].
+            An actor that acts with a running carry starts from it (stored state and burn-in, as in
+            Kapturowski et al., 2019). None if histories start with a zero carry.
+        following: whether the current step is the step after each of the m steps.
+        burn_in_gradient: whether gradients flow into the burn-in.
     """
 
     steps: Steps
@@ -94,17 +95,17 @@ class Segment:
 
     @property
     def action(self) -> jax.Array:
-        """[B, A], what was done at the m steps."""
+        """[B, A], the actions of the m steps."""
         return flat(self.steps.action[-self.length :])
 
     @property
     def present(self) -> Window:
-        """The current step alone: a window without past tokens."""
+        """The current step only: a window without past tokens."""
         return present(self.observation, self.previous_action)
 
 
 History = Window | Segment
-"""What a network may read at each step of a batch."""
+"""The inputs of a network at each step of a batch."""
 
 
 def flat(rows: jax.Array) -> jax.Array:
@@ -133,12 +134,12 @@ def empty_steps(capacity: int, observation_size: int, action_size: int) -> Steps
 
 
 def put_row(ring: jax.Array, slot: jax.Array, row: jax.Array) -> jax.Array:
-    """``ring`` [C, ...] with ``row`` [...] in ``slot``: one row is written, in place under jit."""
+    """``ring`` [C, ...] with ``row`` [...] in ``slot``; written in place under jit."""
     return jax.lax.dynamic_update_index_in_dim(ring, row.astype(ring.dtype), slot, axis=0)
 
 
 def put_rows(ring: jax.Array, slot: jax.Array, rows: jax.Array) -> jax.Array:
-    """``ring`` [C, ...] with ``rows`` [K, ...] from ``slot`` on; in place under jit."""
+    """``ring`` [C, ...] with ``rows`` [K, ...] from ``slot`` on; written in place under jit."""
     return jax.lax.dynamic_update_slice_in_dim(ring, rows.astype(ring.dtype), slot, axis=0)
 
 
@@ -159,18 +160,18 @@ def window_at(
     previous_action: jax.Array,
     environments: int = 1,
 ) -> Window:
-    """What may be read at step ``step_number``.
+    """The window of step ``step_number``.
 
     Args:
         ring: the steps.
         step_number: int32 [B], at most ``count``.
-        episode_step: int32 [B], steps of the same episode before it.
-        count: int32 [], steps ever written; the ring holds the last C of them.
+        episode_step: int32 [B], number of earlier steps of the same episode.
+        count: int32 [], number of steps written so far; the ring holds the last C of them.
         window_tokens: L, past tokens in the window's arrays.
         history_length: l <= L, past tokens that may be read.
-        observation: [B, O], of the step.
-        previous_action: [B, A], before it.
-        environments: K, how many act side by side.
+        observation: [B, O], the observation of the step.
+        previous_action: [B, A], the action of the previous step.
+        environments: K, number of environments that step together.
     """
     capacity = ring.action.shape[0]
     offset = environments * jnp.arange(window_tokens, 0, -1, dtype=jnp.int32)
@@ -196,18 +197,18 @@ def segment_at(
     burn_in_gradient: bool,
     environments: int = 1,
 ) -> tuple[Segment, jax.Array]:
-    """The m steps of an environment from ``first`` on, the burn-in before, and their slots [m, M].
+    """The m steps of an environment from ``first`` on with their burn-in, and their slots [m, M].
 
     Args:
         ring: the steps.
-        episode_steps: int32 [C], steps of the same episode before each.
-        first: int32 [M], such that the last of the m steps is below ``count``.
-        count: int32 [], steps ever written; the ring holds the last C of them.
+        episode_steps: int32 [C], number of earlier steps of the same episode, for each step.
+        first: int32 [M], the number of the first of the m steps; the last is less than ``count``.
+        count: int32 [], number of steps written so far; the ring holds the last C of them.
         window_tokens: L, tokens of the burn-in.
         length: m.
         history_length: l <= L, tokens of the burn-in that may be read.
         burn_in_gradient: see `Segment`.
-        environments: K, how many act side by side.
+        environments: K, number of environments that step together.
     """
     capacity = episode_steps.shape[0]
     offset = jnp.arange(-window_tokens, length, dtype=jnp.int32)
@@ -236,13 +237,13 @@ def segment_at(
 def next_window(
     window: Window, action: jax.Array, next_observation: jax.Array, history_length: jax.Array | int
 ) -> Window:
-    """The window one step later: the current step has become a past token.
+    """The window one step later, in which the current step is a past token.
 
     Args:
-        window: of the current step.
-        action: [B, A], what was done.
-        next_observation: [B, O], what was then seen, a final observation included.
-        history_length: l, the most past tokens that may be read.
+        window: the window of the current step.
+        action: [B, A], the action of the current step.
+        next_observation: [B, O], the next observation; it may be a final observation.
+        history_length: l, the maximum number of past tokens.
     """
     current = Steps(window.observation, window.previous_action, action)
     window_tokens = window.past.action.shape[0]
@@ -256,5 +257,5 @@ def next_window(
 
 
 def _limited(length: jax.Array, window_tokens: int, history_length: jax.Array | int) -> jax.Array:
-    """``length`` int32 [B], as far as the window's arrays and the agent's own length allow."""
+    """``length`` int32 [B], limited by the window's arrays and the history length."""
     return jnp.minimum(jnp.minimum(length, window_tokens), history_length).astype(jnp.int32)

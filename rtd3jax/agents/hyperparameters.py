@@ -1,4 +1,4 @@
-"""The numbers of a configuration in which lanes of one program may differ."""
+"""The traced numbers of a configuration, in which lanes of one program may differ."""
 
 import dataclasses
 
@@ -8,7 +8,7 @@ from flax import struct
 
 @struct.dataclass
 class Hyperparameters:
-    """float32 [] each, the history length l int32 []; see `rtd3jax.Config`."""
+    """Numbers float32 [], and the history length l, int32 []; see `rtd3jax.Config`."""
 
     actor_learning_rate: jax.Array
     critic_learning_rate: jax.Array
@@ -23,7 +23,7 @@ class Hyperparameters:
     history_length: jax.Array
 
     def decayed(self, progress: jax.Array) -> "Hyperparameters":
-        """These numbers when the share ``progress`` [] of all steps is done: the rates decay."""
+        """These numbers after the fraction ``progress`` [] of all steps: learning rates decay."""
         scale = 1.0 - (1.0 - self.final_learning_rate_fraction) * progress
         return dataclasses.replace(
             self,

@@ -1,7 +1,7 @@
 """Actor and critic: encoder, memory, head (paper, Appendix: "Network Structure"), as flax modules.
 
-A `Network` is put together from modules, each of which can be another: its fields are the names
-under which the parameters stand. Shapes: ``L`` past tokens, ``B`` batch, ``O`` and ``A`` sizes of
+A `Network` consists of exchangeable modules; the names of its fields are the names of its
+parameters. Shapes: ``L`` past tokens, ``B`` batch, ``O`` and ``A`` sizes of
 an observation and an action, ``H`` width.
 """
 
@@ -25,14 +25,14 @@ LAYERS = ("encoder", "memory", "current", "head", "output")
 
 @dataclasses.dataclass(frozen=True)
 class NetworkSpec:
-    """What one network reads.
+    """The inputs of one network.
 
     Attributes:
-        memory: parts of each token of the recurrent stream; empty for none.
-        memory_has_current: whether that stream ends with the current token.
-        current: parts of the input of the feed-forward stream; empty for none.
-        carry_from_replay: whether the memory starts from the behaviour actor's stored carry instead
-            of reading the past tokens itself (h-td3's critic).
+        memory: parts of each token of the recurrent stream; empty without this stream.
+        memory_has_current: whether the recurrent stream ends with the current token.
+        current: parts of the input of the feed-forward stream; empty without this stream.
+        carry_from_replay: whether the memory starts from the behaviour actor's stored carry and
+            does not read the past tokens (h-td3's critic).
     """
 
     memory: tuple[str, ...] = ()
@@ -42,13 +42,13 @@ class NetworkSpec:
 
 
 class Linear(nn.Module):
-    """``x @ kernel + bias`` [B, outputs]; uniform in ±1/sqrt(inputs) at the start.
+    """``x @ kernel + bias`` [B, outputs]; initial values are uniform in ±1/sqrt(inputs).
 
     Attributes:
         inputs: elements of an input.
         outputs: elements of an output.
-        precision: of a wide product's factors; None for a narrow product, whose factors are never
-            rounded: an observation costs little and would lose most.
+        precision: precision of the factors of a large product; None for a small product, whose
+            factors are never rounded: its cost is low, and observations need the precision.
     """
 
     inputs: int
@@ -60,7 +60,7 @@ class Linear(nn.Module):
         self.bias = self.param("bias", lambda key: self.initial(key)["bias"])
 
     def initial(self, key: jax.Array) -> Params:
-        """The initialisation that the stack of the paper's parameter counts implies."""
+        """Initial parameters, uniform in ±1/sqrt(inputs)."""
         bound = self.inputs**-0.5
         shape = (self.inputs, self.outputs)
         kernel_key, bias_key = jax.random.split(key)
@@ -80,12 +80,12 @@ class Network(nn.Module):
     """An actor or a critic.
 
     Attributes:
-        reads: what it reads.
-        head: from the features of its streams to H.
-        output: from H to the outputs.
-        encoder: of each token of the recurrent stream, before its ReLU; None without that stream.
-        memory: the recurrent stream's; None without it.
-        current: of the feed-forward stream, before its ReLU; None without it.
+        reads: the inputs of the network.
+        head: layer from the features of the streams to H.
+        output: layer from H to the outputs.
+        encoder: first layer of the recurrent stream, before its ReLU; None without this stream.
+        memory: recurrent cell of the recurrent stream; None without this stream.
+        current: first layer of the feed-forward stream, before its ReLU; None without this stream.
     """
 
     reads: NetworkSpec
@@ -101,9 +101,10 @@ class Network(nn.Module):
         """The output [B, outputs].
 
         Args:
-            window: of the step.
-            action: [B, A], the current action; critics need it.
-            carry: the carry after the past tokens, where it is known; they are not read then.
+            window: the window of the step.
+            action: [B, A], the current action, for critics.
+            carry: the carry after the past tokens, if it is known; the past tokens are then not
+                read.
         """
         feature = current = None
         if self.reads.memory:
@@ -113,7 +114,7 @@ class Network(nn.Module):
         return self.from_features(feature, current)
 
     def from_features(self, feature: jax.Array | None, current: jax.Array | None) -> jax.Array:
-        """The output [B, outputs] of the memory's ``feature`` [B, H] and the ``current`` token."""
+        """The output [B, outputs] for the memory's ``feature`` [B, H] and the ``current`` token."""
         features = [] if feature is None else [feature]
         if current is not None:
             assert self.current is not None
@@ -122,7 +123,7 @@ class Network(nn.Module):
         return self.output(jax.nn.relu(hidden))
 
     def carry_before(self, window: Window) -> Carry:
-        """The memory's carry after the window's past tokens, before the current one."""
+        """The memory's carry after the past tokens of the window, before the current token."""
         assert self.memory is not None
         encoded = self.encode(past_tokens(self.reads.memory, window.past))
         return self.memory.end(None, encoded, window.exists)
@@ -130,14 +131,14 @@ class Network(nn.Module):
     def carries(self, carry: Carry | None, tokens: jax.Array, starts: jax.Array) -> Carry:
         """The memory's carries [T, B, ...] after each of ``tokens`` [T, B, parts].
 
-        ``carry`` is before the first of them, None for zeros; before those that ``starts`` marks it
-        is zero.
+        ``carry`` is the carry before the first token, None for zeros. The carry is zero before each
+        token that ``starts`` marks.
         """
         assert self.memory is not None
         return self.memory.carries(carry, self.encode(tokens), starts)
 
     def advance(self, window: Window, action: jax.Array, carry: Carry) -> Carry:
-        """The carry after the present step has become a past one, with the ``action`` [B, A]."""
+        """The carry after the token of the present step with its ``action`` [B, A]."""
         assert self.memory is not None
         token = current_token(self.reads.memory, window, action)
         return self.memory.step(carry, self.encode(token[None])[0])
@@ -145,7 +146,7 @@ class Network(nn.Module):
     def from_carries(
         self, window: Window, action: jax.Array | None, before: Carry, after: Carry
     ) -> jax.Array:
-        """The output [B, outputs] from the carries before and after the present step."""
+        """The output [B, outputs] from the carries before and after the current token."""
         assert self.memory is not None
         feature = self.memory.read(after if self.reads.memory_has_current else before)
         current = None
@@ -158,13 +159,13 @@ class Network(nn.Module):
         return None if self.memory is None else self.memory.zero(batch)
 
     def encode(self, tokens: jax.Array) -> jax.Array:
-        """Every token [T, B, parts], encoded: [T, B, H]."""
+        """The encoded tokens [T, B, H] of ``tokens`` [T, B, parts]."""
         assert self.encoder is not None
         flat = jax.nn.relu(self.encoder(tokens.reshape(-1, tokens.shape[-1])))
         return flat.reshape(*tokens.shape[:2], flat.shape[-1])
 
     def _remember(self, window: Window, action: jax.Array | None, carry: Carry | None) -> jax.Array:
-        """The memory's feature [B, H]: its output after the stream's last token."""
+        """The memory's feature [B, H]: its output after the last token of the stream."""
         assert self.memory is not None
         if not self.reads.memory_has_current:
             return self.memory.read(self.carry_before(window) if carry is None else carry)
@@ -190,16 +191,16 @@ def make_network(
     """The network of an agent.
 
     Args:
-        reads: what it reads.
-        memory: its name, as registered.
+        reads: the inputs of the network.
+        memory: the registered name of the memory.
         sizes: elements of each part: ``observation``, ``action``, ``previous_action``.
         width: H.
-        outputs: elements of its output: A for an actor, 1 for a critic.
-        precision: of its wide products' factors; see `rtd3jax.agents.products`.
-        encoder: called with ``inputs`` and ``outputs``, the module of each stream's first layer.
+        outputs: elements of the output: A for an actor, 1 for a critic.
+        precision: precision of the factors of large products; see `rtd3jax.agents.products`.
+        encoder: a function of ``inputs`` and ``outputs`` that returns the first layer of a stream.
 
     Raises:
-        UserError: when the memory or the encoder does not keep to its interface.
+        UserError: when the memory or the encoder violates its interface.
     """
 
     def first_layer(parts: tuple[str, ...]) -> nn.Module:
@@ -222,7 +223,7 @@ def make_network(
 
 
 def init_network(key: jax.Array, network: Network) -> Params:
-    """Parameters of ``network`` at the start of training, under the names of its fields."""
+    """Initial parameters of ``network``, under the names of its fields."""
     keys = dict(zip(LAYERS, jax.random.split(key, len(LAYERS)), strict=True))
     params: Params = {}
     for name in LAYERS:
@@ -243,10 +244,11 @@ def apply_network(
 
     Args:
         network: an actor or a critic.
-        params: its parameters.
+        params: the parameters of the network.
         history: a window or a segment; see `rtd3jax.agents.history`.
-        action: [B, A], the current action, which critics read. None with a segment: what was done.
-        carry: the carry before the current token, where it is known; the past is not read then.
+        action: [B, A], the current action, for critics. With a segment, None means the actions of
+            the segment.
+        carry: the carry before the current token, if it is known; past tokens are then not read.
     """
     chex.assert_rank((history.observation, history.previous_action), 2)
     if action is not None:
@@ -258,7 +260,7 @@ def apply_network(
 
 
 def act(actor: Network, params: Params, history: History, carry: Carry | None = None) -> jax.Array:
-    """The deterministic action [B, A] of an actor, in half ranges: tanh of the output."""
+    """The deterministic action [B, A] of an actor in half ranges: the tanh of its output."""
     if isinstance(history, Segment):
         output = _apply_to_segment(actor, params, history, None, carry, history.start)
         return jnp.tanh(output)
@@ -266,7 +268,7 @@ def act(actor: Network, params: Params, history: History, carry: Carry | None = 
 
 
 def carry_before(network: Network, params: Params, history: History) -> Carry:
-    """The carry after the past tokens of ``history``, before the current one."""
+    """The carry after the past tokens of ``history``, before the current token."""
     if isinstance(history, Segment):
         before, after = segment_carries(network, params, history)
         return after if history.following else before
@@ -276,7 +278,7 @@ def carry_before(network: Network, params: Params, history: History) -> Carry:
 def advance(
     network: Network, params: Params, window: Window, action: jax.Array, carry: Carry
 ) -> Carry:
-    """The carry after the present step of ``window``, at which ``action`` [B, A] was done."""
+    """The carry after the current token of ``window``, with its ``action`` [B, A]."""
     return network.apply({"params": params}, window, action, carry, method="advance")
 
 
@@ -285,7 +287,7 @@ def segment_carries(
 ) -> tuple[Carry, Carry]:
     """The carries, leaves [B, ...], before and after the token of each of the segment's steps.
 
-    ``start`` is the carry before the burn-in's first token; by default the history begins there.
+    ``start`` is the carry before the first token of the burn-in, zeros by default.
     """
     tokens = past_tokens(network.reads.memory, segment.steps)
     burn_in = tokens.shape[0] - segment.length
@@ -323,13 +325,13 @@ def _apply_to_segment(
     carry: Carry | None,
     start: Carry | None = None,
 ) -> jax.Array:
-    """`apply_network`: one pass over the tokens, then one step of the memory for all B at once."""
+    """`apply_network` for a segment: a pass over the tokens, then one step for all B."""
     recorded = action is None and not segment.following
     if recorded:
         action = segment.action
     if network.reads.memory and carry is None:
         before, after = segment_carries(network, params, segment, start)
-        if recorded:  # the current token is one of the segment's own, already passed
+        if recorded:  # the pass over the segment's tokens has included the current token
             carries = before, after
             return _output(
                 network, params, segment.present, action, *carries, method="from_carries"
@@ -340,12 +342,12 @@ def _apply_to_segment(
 
 def _output(network: Network, params: Params, *inputs: Any, method: str | None = None) -> jax.Array:
     output = network.apply({"params": params}, *inputs, method=method)
-    assert isinstance(output, jax.Array)  # and no mutable collections beside it
+    assert isinstance(output, jax.Array)  # and not a tuple with mutable collections
     return output
 
 
 def part_sizes(observation_size: int, action_size: int) -> dict[str, int]:
-    """Elements of each part that a token may hold."""
+    """Number of elements of each part of a token."""
     return {
         "observation": observation_size,
         "action": action_size,
@@ -359,7 +361,7 @@ def past_tokens(parts: tuple[str, ...], steps: Steps) -> jax.Array:
 
 
 def current_token(parts: tuple[str, ...], window: Window, action: jax.Array | None) -> jax.Array:
-    """The token [B, parts] of the present step."""
+    """The token [B, parts] of the current step."""
     values: dict[str, Any] = {
         "observation": window.observation,
         "previous_action": window.previous_action,
@@ -369,7 +371,7 @@ def current_token(parts: tuple[str, ...], window: Window, action: jax.Array | No
 
 
 def _initial(module: nn.Module, key: jax.Array) -> Params:
-    """A part's parameters: by its own ``initial``, or as flax draws them."""
+    """Initial parameters of a module: from its method ``initial``, or else from flax."""
     if isinstance(module, Linear | Memory):
         return module.initial(key)
     return module.init(key, _example(module, 1)).get("params", {})
@@ -380,16 +382,16 @@ def _example(module: nn.Module, batch: int) -> jax.Array:
 
 
 def _check_encoder(module: nn.Module, width: int) -> None:
-    """Raise UserError, before anything is compiled, unless the module gives what it should."""
+    """Raise UserError, before anything is compiled, if the encoder violates its interface."""
     name = type(module).__name__
     try:
         given = jax.eval_shape(
             lambda: module.init_with_output(jax.random.key(0), _example(module, 2))[0]
         )
-    except Exception as error:  # the user's own code, which may raise anything
+    except Exception as error:  # code of a user, which may raise any error
         raise UserError(f"encoder {name} failed: {first_line(error)}") from error
     if (given.shape, given.dtype) != ((2, width), jnp.float32):
         raise UserError(
-            f"encoder {name} must give float32 [batch, {width}], not "
+            f"encoder {name} must return float32 [batch, {width}], not "
             f"{given.dtype}{list(given.shape)} for a batch of 2"
         )

@@ -1,4 +1,4 @@
-"""Noise on actions, for exploration and for the smoothing of values."""
+"""Noise on actions, for exploration and for target policy smoothing."""
 
 import jax
 import jax.numpy as jnp

@@ -1,7 +1,7 @@
-"""Observations in running deviations about their running mean, for networks alone.
+"""Normalises observations by their running mean and standard deviation, for the networks.
 
-Replay keeps what was seen; a network reads ``(observation - mean) / deviation``, element by
-element, under the statistics of the moment. ``O`` is the size of an observation.
+The replay stores observations without normalisation. A network reads ``(observation - mean) /
+deviation``, element by element, with the current statistics. ``O`` is the size of an observation.
 """
 
 import dataclasses
@@ -14,26 +14,26 @@ from flax import struct
 from rtd3jax.agents.history import History, Steps, Window
 
 LIMIT = 10.0
-"""Deviations from the mean beyond which a reading is cut off: one outlier cannot drown the rest."""
+"""Normalised observations are clipped to ±LIMIT, so that an outlier has a limited effect."""
 
 _RESOLVED = 1e-6
-"""Deviations below this share of the mean are what float32 cannot tell from rounding."""
+"""A deviation below this fraction of the mean is treated as a rounding error of float32."""
 
 
 @struct.dataclass
 class Normaliser:
-    """An element-wise map that serves every observation of one policy.
+    """An element-wise linear map of observations.
 
     Attributes:
         mean: [O], in the observation's units.
-        scale: [O], one over the deviation; one for an element that does not change.
+        scale: [O], the inverse deviation; one for an element that is constant.
     """
 
     mean: jax.Array
     scale: jax.Array
 
     def __call__(self, observation: jax.Array) -> jax.Array:
-        """``observation`` [..., O] in deviations about the mean, between -LIMIT and LIMIT."""
+        """The normalised ``observation`` [..., O], clipped to [-LIMIT, LIMIT]."""
         ones = (1,) * (observation.ndim - 1)
         mean, scale = self.mean.reshape(*ones, -1), self.scale.reshape(*ones, -1)
         return jnp.clip((observation - mean) * scale, -LIMIT, LIMIT)
@@ -44,9 +44,9 @@ class Statistics:
     """Running statistics of a lane's observations.
 
     Attributes:
-        count: int32 [], observations so far.
+        count: int32 [], number of observations so far.
         mean: [O].
-        variance: [O], of the population of those observations.
+        variance: [O], the population variance of these observations.
     """
 
     count: jax.Array
@@ -54,7 +54,7 @@ class Statistics:
     variance: jax.Array
 
     def note(self, observations: jax.Array) -> "Statistics":
-        """The statistics with K more ``observations`` [K, O] (Welford, 1962; Chan et al., 1983)."""
+        """The statistics after K more ``observations`` [K, O] (Welford 1962; Chan et al. 1983)."""
         number = observations.shape[0]
         count = self.count + jnp.int32(number)
         share = number / count.astype(jnp.float32)
@@ -62,26 +62,26 @@ class Statistics:
         within = jnp.mean(jnp.square(observations - centre[None, :]), axis=0)
         change = centre - self.mean
         mean = self.mean + share * change
-        # The mean of squares, not their sum: it does not grow, so float32 goes on resolving it.
+        # The mean of squares, not their sum: the mean does not grow, so float32 resolves it.
         between = (1.0 - share) * jnp.square(change)
         variance = self.variance + share * (within + between - self.variance)
         return Statistics(count, mean, variance)
 
     def normaliser(self) -> Normaliser:
-        """The map under these statistics."""
+        """The normalisation with these statistics."""
         deviation = jnp.sqrt(jnp.maximum(self.variance, 0.0))
         changes = deviation > _RESOLVED * jnp.abs(self.mean)
         return Normaliser(self.mean, jnp.where(changes, 1.0 / jnp.where(changes, deviation, 1), 1))
 
 
 def no_statistics(observation_size: int) -> Statistics:
-    """Before the first observation."""
+    """The statistics of zero observations."""
     zeros = jnp.zeros((observation_size,), jnp.float32)
     return Statistics(jnp.int32(0), zeros, zeros)
 
 
 def as_read(observation: jax.Array, normaliser: Normaliser | None) -> jax.Array:
-    """``observation`` [..., O] as a network reads it: as it is without a normaliser."""
+    """``observation`` [..., O], normalised unless ``normaliser`` is None."""
     return observation if normaliser is None else normaliser(observation)
 
 
@@ -94,7 +94,7 @@ def normalised(history: History, normaliser: Normaliser | None) -> History: ...
 
 
 def normalised(history: History, normaliser: Normaliser | None) -> History:
-    """``history`` with every observation as a network reads it."""
+    """``history`` with all observations normalised, unless ``normaliser`` is None."""
 
     def of(steps: Steps) -> Steps:
         return dataclasses.replace(steps, observation=as_read(steps.observation, normaliser))

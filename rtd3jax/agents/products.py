@@ -1,8 +1,8 @@
 """Matrix products in a chosen precision, forward and backward.
 
-In ``bfloat16`` the factors of a product are rounded to 8 bits of mantissa; its sums, and whatever
-is kept between products (parameters, gradients, carries), stay in float32. On processors with
-bfloat16 units such a product costs a fraction of a float32 one.
+With ``bfloat16``, the factors of a product are rounded to 8 bits of mantissa. Its sums, and all
+stored values (parameters, gradients, carries), stay in float32. On processors with bfloat16 units,
+such a product takes a fraction of the time of a float32 product.
 """
 
 import functools
@@ -12,12 +12,12 @@ import jax.numpy as jnp
 
 
 def narrow(x: jax.Array, precision: str) -> jax.Array:
-    """``x`` as a factor of a product: rounded to ``bfloat16``, or as it is."""
+    """``x`` as a factor of a product: rounded to ``bfloat16``, or unchanged."""
     return x.astype(jnp.bfloat16) if precision == "bfloat16" else x
 
 
 def product(x: jax.Array, y: jax.Array) -> jax.Array:
-    """``x @ y`` of factors of one precision, summed in float32 at least."""
+    """``x @ y`` for factors of the same precision, summed in float32 at least."""
     return jnp.dot(x, y, preferred_element_type=jnp.float32 if _is_narrow(x) else x.dtype)
 
 
@@ -26,9 +26,9 @@ def weight_gradient(x: jax.Array, gradient: jax.Array) -> jax.Array:
     flat = gradient.reshape(-1, gradient.shape[-1])
     if not _is_narrow(x):
         return product(x.reshape(-1, x.shape[-1]).T, flat)
-    # XLA's CPU backend has no bfloat16 product of a transposed factor: it would quietly take the
-    # float32 one. So the factor is transposed for real, in two steps that stay in the cache; the
-    # barriers keep them apart.
+    # XLA's CPU backend has no bfloat16 product of a transposed factor: it would silently use the
+    # float32 product. So the factor is transposed explicitly, in two steps that fit in the cache;
+    # the barriers keep XLA from merging the steps.
     barrier = jax.lax.optimization_barrier
     by_token = barrier(jnp.swapaxes(x, 1, 2))
     transposed = barrier(jnp.swapaxes(by_token, 0, 1)).reshape(x.shape[-1], -1)
@@ -41,7 +41,7 @@ def _is_narrow(x: jax.Array) -> bool:
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
 def matmul(x: jax.Array, kernel: jax.Array, precision: str) -> jax.Array:
-    """``x @ kernel`` [B, O] for float32 [B, I] and [I, O], as is the gradient of either."""
+    """``x @ kernel`` [B, O] for float32 [B, I] and [I, O]; its gradients are float32 too."""
     return product(narrow(x, precision), narrow(kernel, precision))
 
 

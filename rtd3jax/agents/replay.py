@@ -1,9 +1,9 @@
-"""A lane's replay: a ring of transitions, and batches of windows cut from it.
+"""A lane's replay: a ring buffer of transitions, from which batches of windows are read.
 
-Every environment step writes one row, so a row's number follows from the lane's step and the ring
-needs no counter of its own: of K environments side by side, environment e writes row ``s K + e`` at
-the lane's step s. Where an agent's critics start from the behaviour actor's carries (h-td3), the
-ring keeps these too; what that asks of the order of reads and writes is dealt with here alone.
+Every environment step writes one row, so the lane's step determines the number of the row, and the
+ring needs no counter: of K environments, environment e writes row ``s K + e`` at the lane's step s.
+If the critics of an agent start from the behaviour actor's carries (h-td3), the ring also stores
+these carries. This module ensures the order of reads and writes that this requires.
 Shapes: ``C`` capacity, ``B`` batch, ``H`` width.
 """
 
@@ -31,15 +31,14 @@ from rtd3jax.agents.memory.base import Carry
 
 @struct.dataclass
 class Transition:
-    """One environment step. Leaves: [C, ...] in the ring, [...] as a row.
+    """One environment step. Leaves are [C, ...] in the ring, and [...] as a row.
 
     Attributes:
-        step: what the agent saw, what it had done before, and what it did.
+        step: the observation, the previous action, and the action.
         reward: [].
-        next_observation: [O]; at an episode's end the final observation, never the next episode's
-            first.
-        terminated: bool []; stops bootstrapping. A time limit is not a termination.
-        episode_step: int32 [], steps of the same episode before this one; bounds the window.
+        next_observation: [O]; at the end of an episode, the final observation of this episode.
+        terminated: bool []; no bootstrapping after it. A time limit is not a termination.
+        episode_step: int32 [], number of earlier steps of the same episode; it limits the window.
     """
 
     step: Steps
@@ -51,14 +50,14 @@ class Transition:
 
 @struct.dataclass
 class Replay:
-    """The ring.
+    """The ring buffer.
 
     Attributes:
         transitions: leaves [C, ...].
         carries: None, or leaves [C + K, ...]: slot n % (C + K) holds the behaviour actor's carry
-            before step n's current token, that is the carry *of* row n and the *next* carry of row
-            n - K. An episode's first step has no past, so its carry is zero and its slot is free
-            for the carry that belongs to the final observation of the episode before.
+            before the token of step n. It is the carry of row n, and the next carry of row n - K.
+            The carry of an episode's first step is zero and needs no slot, so the slot holds the
+            carry before the final observation of the previous episode.
         environments: K; it divides C.
     """
 
@@ -71,7 +70,7 @@ class Replay:
 class Batch:
     """Sampled transitions, leaves [B, ...]; ``carry`` and ``next_carry`` for h-td3 only.
 
-    ``window`` and ``next_window`` are windows, or segments whose tokens serve several transitions;
+    ``window`` and ``next_window`` are windows, or segments, in which transitions share tokens;
     `rtd3jax.agents.networks.apply_network` takes both.
     """
 
@@ -85,7 +84,7 @@ class Batch:
 
     @property
     def recorded_action(self) -> jax.Array | None:
-        """``action`` for `apply_network`: None where a segment's own tokens hold it."""
+        """``action`` for `apply_network`: None with a segment, whose tokens contain it."""
         return None if isinstance(self.window, Segment) and self.carry is None else self.action
 
 
@@ -96,7 +95,7 @@ def empty_replay(
     carry: Carry | None,
     environments: int = 1,
 ) -> Replay:
-    """A ring of ``capacity`` rows; with carries like ``carry`` (leaves [1, ...]), unless None."""
+    """A ring of ``capacity`` rows; it stores carries like ``carry`` [1, ...] unless None."""
     transitions = Transition(
         step=empty_steps(capacity, observation_size, action_size),
         reward=jnp.zeros((capacity,), jnp.float32),
@@ -119,14 +118,14 @@ def present_window(
     window_tokens: int,
     history_length: jax.Array | int,
 ) -> Window:
-    """The windows of the lane's step ``step`` (int32 []), which is not written yet: a batch of K.
+    """The K windows of the lane's step ``step`` (int32 []), which is not in the ring yet.
 
     Args:
-        replay: the ring, with all steps before.
-        step: the step's number.
-        episode_step: int32 [K], steps of the same episode before it.
-        observation: [K, O], seen at it.
-        previous_action: [K, A], before it.
+        replay: the ring, with all earlier steps.
+        step: the number of the step.
+        episode_step: int32 [K], number of earlier steps of the same episode.
+        observation: [K, O], the observations of the step.
+        previous_action: [K, A], the previous actions.
         window_tokens: L, past tokens in the window's arrays.
         history_length: l <= L, past tokens that may be read.
     """
@@ -145,7 +144,7 @@ def present_window(
 
 
 def put_transitions(replay: Replay, first: jax.Array, rows: Transition) -> Replay:
-    """The ring with the K environments' ``rows`` (leaves [K, ...]) from step ``first`` on."""
+    """The ring after writing ``rows`` of K environments (leaves [K, ...]) from ``first`` on."""
     kept = replay.transitions
     slot = first % kept.reward.shape[0]
     written = jax.tree.map(lambda ring, new: put_rows(ring, slot, new), kept, rows)
@@ -153,7 +152,7 @@ def put_transitions(replay: Replay, first: jax.Array, rows: Transition) -> Repla
 
 
 def put_carries(replay: Replay, first: jax.Array, rows: Carry) -> Replay:
-    """The ring with the actor's carries (leaves [K, ...]) before the steps from ``first`` on."""
+    """The ring after writing the carries (leaves [K, ...]) of the steps from ``first`` on."""
     slot = _carry_slot(replay.carries, first)
     carries = jax.tree.map(lambda kept, new: put_rows(kept, slot, new), replay.carries, rows)
     return dataclasses.replace(replay, carries=carries)
@@ -162,9 +161,10 @@ def put_carries(replay: Replay, first: jax.Array, rows: Carry) -> Replay:
 def keep_acting_carry(
     replay: Replay, step: jax.Array, episode_step: jax.Array, carry: Carry | None
 ) -> Replay:
-    """Keep the carries (leaves [K, ...]) with which step ``step`` acts; before it is learned from.
+    """Store the carries (leaves [K, ...]) with which step ``step`` acts, before its updates.
 
-    Not an episode's first one: its slot holds the carry of the last episode's final observation.
+    The carry of an episode's first step is not stored: its slot holds the carry before the final
+    observation of the previous episode.
     """
     if replay.carries is None:
         return replay
@@ -187,22 +187,22 @@ def store(
     final_carry: Callable[[], Carry],
     never: jax.Array,
 ) -> Replay:
-    """The ring after step ``step``, whose updates have read it.
+    """Write step ``step`` into the ring, after the updates of this step have read the ring.
 
     Args:
         replay: the ring.
         step: int32 [].
-        rows: the K environments' transitions, leaves [K, ...].
-        done: bool [K], whether an episode ended with it.
-        final_carry: gives the behaviour actor's carries, leaves [K, ...], before the final
-            observations; called where the ring keeps carries.
-        never: bool [], false, computed from what the updates read; see `_after`.
+        rows: the transitions of the K environments, leaves [K, ...].
+        done: bool [K], whether the step ended an episode.
+        final_carry: returns the behaviour actor's carries, leaves [K, ...], before the final
+            observations; only called if the ring stores carries.
+        never: bool [], false, computed from values that the updates read; see `_after`.
     """
     first = _after(step, never) * replay.environments
     replay = put_transitions(replay, first, rows)
     if replay.carries is None:
         return replay
-    # Within an episode the next step's own carry takes this slot.
+    # Within an episode, the carry of the next step overwrites this slot.
     carry = jax.lax.cond(
         jnp.any(done),
         final_carry,
@@ -216,18 +216,18 @@ def store(
 
 @jax.custom_batching.custom_vmap
 def _after(step_number: jax.Array, never: jax.Array) -> jax.Array:
-    """``step_number``, but known only when ``never`` (always false) is.
+    """``step_number``, with a data dependency on ``never``, which is always false.
 
-    A row that is written by it is written after what ``never`` was computed from has read the
-    ring. Where XLA sees no such order, it copies the whole ring at every step to be safe; an
-    optimization barrier does not tell it, since that is removed before copies are decided upon.
+    A write at this number then happens after the reads from which ``never`` was computed. Without
+    this order, XLA copies the whole ring at every step. An optimization barrier does not help:
+    XLA removes barriers before it decides on copies.
     """
     return step_number + never.astype(step_number.dtype)
 
 
 @_after.def_vmap
 def _after_of_lanes(axis_size, batched, step_number, never):
-    # One number for all lanes, lest the write become a scatter.
+    # All lanes use the same number, so that the write does not become a scatter.
     assert not batched[0]
     return _after(step_number, jnp.any(never)), False
 
@@ -240,12 +240,12 @@ def sample(
     window_tokens: int,
     history_length: jax.Array | int,
 ) -> Batch:
-    """Uniform draws, with replacement, from the rows kept; the cost does not depend on C.
+    """A batch drawn uniformly, with replacement; the time does not depend on C.
 
     Args:
         replay: the ring.
         key: consumed here.
-        count: int32 [], steps written so far, at least 1.
+        count: int32 [], number of steps written so far, at least 1.
         batch_size: B.
         window_tokens: L, past tokens in a window.
         history_length: l <= L, past tokens that may be read.
@@ -263,7 +263,7 @@ def gather(
     window_tokens: int,
     history_length: jax.Array | int,
 ) -> Batch:
-    """The batch of the rows with these numbers (int32 [B], all of them kept); see `sample`."""
+    """The batch of the rows with these numbers (int32 [B]), which are in the ring; see `sample`."""
     kept = replay.transitions
     slot = step_number % kept.reward.shape[0]
     episode_step = kept.episode_step[slot]
@@ -304,20 +304,20 @@ def sample_segments(
     critic_reads_carries: bool = True,
     actor_goes_on: bool = False,
 ) -> Batch:
-    """As `sample`, but B / m stretches of m consecutive steps, their first steps uniform.
+    """As `sample`, but B / m segments of m consecutive steps; their first steps are uniform.
 
     Args:
         replay: the ring.
         key: consumed here.
-        count: int32 [], steps written so far, at least m.
+        count: int32 [], number of steps written so far, at least m.
         batch_size: B, a multiple of m.
         window_tokens: L, steps of the burn-in.
         history_length: l <= L, steps of the burn-in that may be read.
         length: m.
-        burn_in_gradient: whether a gradient flows back into the burn-in.
-        critic_reads_carries: whether the batch holds the ring's carries, if it keeps any, for the
+        burn_in_gradient: whether gradients flow into the burn-in.
+        critic_reads_carries: whether the batch holds the ring's carries, if there are any, for the
             critic.
-        actor_goes_on: whether its segments begin with those carries, from which the actor goes on.
+        actor_goes_on: whether the segments begin with the ring's carries, for the actor.
     """
     oldest = jnp.maximum(count - replay.transitions.reward.shape[0], 0)
     last = count - (length - 1) * replay.environments
@@ -340,9 +340,9 @@ def gather_segments(
     critic_reads_carries: bool = True,
     actor_goes_on: bool = False,
 ) -> Batch:
-    """The batch of the stretches that begin at these numbers (int32 [M]); see `sample_segments`.
+    """The batch of the segments that begin at these numbers (int32 [M]); see `sample_segments`.
 
-    Transitions lie in the order of `Segment`: number by number, the M places side by side.
+    The transitions have the order of `Segment`: the place is the fastest index.
     """
     kept = replay.transitions
     segment, slots = segment_at(
@@ -387,7 +387,7 @@ def gather_segments(
 def _stored_carries(
     replay: Replay, step_number: jax.Array, episode_step: jax.Array
 ) -> tuple[Carry | None, Carry | None]:
-    """The behaviour actor's carries before steps ``step_number`` (int32 [B]) and after them."""
+    """The behaviour actor's carries before the steps ``step_number`` (int32 [B]), and after."""
     if replay.carries is None:
         return None, None
     carry = jax.tree.map(

@@ -1,11 +1,11 @@
-"""The agents as data: all in which one agent differs from another (paper, Sections 3, 5 and 6).
+"""The definitions of the agents (paper, Sections 3, 5 and 6).
 
-A network has up to two streams whose features are concatenated before its head:
+A network has one or two streams, whose features are concatenated before the head:
 
 * *memory*: Linear-ReLU-memory over a window of tokens;
-* *current*: Linear-ReLU on the present step alone.
+* *current*: Linear-ReLU on the current step only.
 
-``td3`` is the network without memory; the recurrent agents differ only in what is read where.
+``td3`` has networks without a memory; the recurrent agents only differ in the streams' inputs.
 """
 
 import dataclasses
@@ -18,17 +18,17 @@ from rtd3jax.registries import AGENTS, LEARNERS
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """An agent.
+    """The definition of an agent.
 
     Attributes:
-        actor: what its actor reads.
-        critic: what its critics read.
-        learner: what trains them, as registered.
-        colour: of its curves; one is chosen where it is None.
-        colour_on_dark: on a dark page, where another is needed.
-        peak_arrays: arrays of [l + 1, B, H] that are alive at an update's peak, for the plan of
-            memory: what XLA reserves for the compiled loop on a CPU, divided by their size.
-        encoder: the module of each stream's first layer, called with ``inputs`` and ``outputs``.
+        actor: inputs of the actor.
+        critic: inputs of the critics.
+        learner: registered name of the learner.
+        colour: colour of the curves; None for an automatic choice.
+        colour_on_dark: colour on a dark page, if it must differ.
+        peak_arrays: peak memory of an update, in arrays of [l + 1, B, H], for the memory plan: the
+            bytes that XLA reserves for the compiled loop on a CPU, divided by the size of an array.
+        encoder: a function of ``inputs`` and ``outputs`` that returns the first layer of a stream.
     """
 
     actor: NetworkSpec
@@ -41,12 +41,12 @@ class Variant:
 
     @property
     def has_window(self) -> bool:
-        """Whether it reads past steps, so that a history length means something."""
+        """Whether the agent reads past steps, so that the history length has an effect."""
         return bool(self.actor.memory or self.critic.memory)
 
     @property
     def stores_carry(self) -> bool:
-        """Whether replay keeps the behaviour actor's carries."""
+        """Whether the replay stores the behaviour actor's carries."""
         return self.critic.carry_from_replay
 
 
@@ -57,8 +57,8 @@ PARTS = (_O, _A, _P)
 
 _ONE_HEADED_ACTOR = NetworkSpec(memory=(_O, _P), memory_has_current=True)
 
-# Colours that remain apart for colour-blind readers: the palette of Okabe and Ito, "Color Universal
-# Design" (2008), less its yellow, which is too light for a line on white.
+# Colours that colour-blind readers can distinguish: the palette of Okabe and Ito, "Color Universal
+# Design" (2008), without its yellow, which is too light for a line on white.
 _PAPER: dict[str, Variant] = {
     "td3": Variant(
         actor=NetworkSpec(current=(_O,)),
@@ -105,12 +105,12 @@ ALGORITHMS = tuple(_PAPER)
 
 
 def register_agent(name: str, variant: Variant, *, replace: bool = False) -> None:
-    """Add an agent, which ``Config(algorithm=name)`` then chooses.
+    """Register an agent, for ``Config(algorithm=name)``.
 
     Args:
-        name: by which the configuration, tables and saved files know it.
-        variant: what it is.
-        replace: whether it may take the place of another of that name.
+        name: the name in the configuration, in tables and in saved files.
+        variant: the definition of the agent.
+        replace: whether it may replace an agent of the same name.
 
     Raises:
         UserError: when the name is taken, or ``variant`` cannot be trained.
@@ -122,7 +122,7 @@ def register_agent(name: str, variant: Variant, *, replace: bool = False) -> Non
 
 
 def _check(name: str, variant: Variant) -> None:
-    """Raise UserError unless actor and critic read what there is when they act."""
+    """Raise UserError unless the inputs of actor and critic are available when they act."""
     LEARNERS.check(variant.learner)
     actor, critic = variant.actor, variant.critic
     for role, reads in (("actor", actor), ("critic", critic)):
@@ -135,7 +135,7 @@ def _check(name: str, variant: Variant) -> None:
                 )
     if _A in actor.current or (_A in actor.memory and actor.memory_has_current):
         raise UserError(
-            f"agent {name!r}: its actor reads the action that it is to choose; give it "
+            f"agent {name!r}: its actor reads the action that it must choose; use "
             "'previous_action', or end its memory before the current step"
         )
     if _A not in critic.current and not (_A in critic.memory and critic.memory_has_current):

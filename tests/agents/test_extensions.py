@@ -168,7 +168,7 @@ def test_agents_that_cannot_be_trained_are_one_line():
     cases = (
         (rtd.Variant(reads, critic, learner="sac"), "learner 'sac' is unknown"),
         (rtd.Variant(reads, reads), "critic does not read the current action"),
-        (rtd.Variant(critic, critic), "reads the action that it is to choose"),
+        (rtd.Variant(critic, critic), "reads the action that it must choose"),
         (rtd.Variant(rtd.NetworkSpec(), critic), "its actor reads nothing"),
         (rtd.Variant(rtd.NetworkSpec(current=("reward",)), critic), "reads 'reward'"),
     )

@@ -141,9 +141,9 @@ class _Fails(_Lag):
 @pytest.mark.parametrize(
     ("module", "message"),
     [
-        (_Wide, r"read must give float32 \[batch, 5\], not float32\[2, 10\]"),
-        (_Grows, r"step must give a carry like zero's.*float32\[2, 5\]"),
-        (_Whole, r"zero\(batch\) must give float32 arrays.*not int32\[2, 5\]"),
+        (_Wide, r"read must return float32 \[batch, 5\], not float32\[2, 10\]"),
+        (_Grows, r"step must return a carry like zero's.*float32\[2, 5\]"),
+        (_Whole, r"zero\(batch\) must return float32 arrays.*not int32\[2, 5\]"),
         (_Fails, "failed in step: out of order"),
     ],
 )

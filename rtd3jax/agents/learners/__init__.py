@@ -1,4 +1,4 @@
-"""Learners: what trains an agent's networks from batches of its replay."""
+"""Learners: they train an agent's networks on batches from its replay."""
 
 from rtd3jax.agents.learners.base import register_learner
 from rtd3jax.agents.learners.td3 import make_td3

@@ -1,4 +1,4 @@
-"""`Learner`: the interface of what trains networks, and the table of those that there are."""
+"""`Learner`: the interface of learners, and their registration."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
@@ -14,26 +14,26 @@ from rtd3jax.registries import LEARNERS
 
 
 class Networks(NamedTuple):
-    """An agent's modules; every critic is of the same one."""
+    """The modules of an agent's actor and critic; both critics use the same module."""
 
     actor: Network
     critic: Network
 
 
 class Measured(NamedTuple):
-    """A quantity that is averaged over an evaluation interval: its sum, and how often measured."""
+    """A quantity to be averaged over an evaluation interval: its sum and number of measurements."""
 
     total: jax.Array
     times: jax.Array
 
 
 def measured(value: jax.Array) -> Measured:
-    """One measurement of ``value`` []."""
+    """A single measurement of ``value`` []."""
     return Measured(value.astype(jnp.float32), jnp.float32(1.0))
 
 
 def not_measured() -> Measured:
-    """None."""
+    """Zero measurements."""
     return Measured(jnp.float32(0.0), jnp.float32(0.0))
 
 
@@ -41,15 +41,15 @@ Metrics = dict[str, Measured]
 
 
 class Learner(Protocol):
-    """What an agent learns by."""
+    """The algorithm that trains an agent's networks."""
 
     @property
     def metrics(self) -> tuple[str, ...]:
-        """What `update` measures; ``critic_loss`` is among it, and a lane is lost when that is not
-        finite."""
+        """Names of the quantities that `update` measures; they include ``critic_loss``, which must
+        stay finite, or the lane is lost."""
 
     def init(self, key: jax.Array, networks: Networks) -> Any:
-        """The state at the start: a pytree of arrays with the actor's parameters as ``actor``."""
+        """The initial state: a pytree of arrays whose field ``actor`` holds the actor."""
 
     def update(
         self,
@@ -64,10 +64,10 @@ class Learner(Protocol):
 
         Args:
             networks: actor and critic.
-            state: of `init`.
-            batch: of the replay.
+            state: the learner's state.
+            batch: a batch from the replay.
             keys: [2], consumed here.
-            hyperparameters: the lane's `rtd3jax.agents.hyperparameters.Hyperparameters`, at this
+            hyperparameters: the lane's `rtd3jax.agents.hyperparameters.Hyperparameters` at this
                 step.
             count: int32 [], 1 for the first update.
         """
@@ -76,12 +76,12 @@ class Learner(Protocol):
 def register_learner(
     name: str, make: Callable[[Config], Learner], *, replace: bool = False
 ) -> None:
-    """Add a learner, which a `Variant` names.
+    """Register a learner, for use in a `Variant`.
 
     Args:
-        name: by which variants know it.
-        make: gives the learner of a configuration; equal configurations, equal learners.
-        replace: whether it may take the place of another of that name.
+        name: the name of the learner.
+        make: returns the learner of a configuration; equal configurations give equal learners.
+        replace: whether it may replace a learner of the same name.
 
     Raises:
         UserError: when the name is taken or ``make`` cannot be called.

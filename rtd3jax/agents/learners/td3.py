@@ -1,8 +1,8 @@
 """TD3's targets, losses and updates (Fujimoto et al., 2018), over any of the six agents.
 
-Actions in here are in half ranges about the centre of the environment's range, within [-1, 1], so
-that an agent learns the same in whatever unit the environment takes its actions; `Bounds` converts
-at the border. Shapes: ``B`` batch, ``A`` action elements.
+Actions are in half ranges from the centre of the environment's range, within [-1, 1], so learning
+does not depend on the units of the environment's actions; `Bounds` converts them. Shapes: ``B``
+batch, ``A`` action elements.
 """
 
 import dataclasses
@@ -25,15 +25,15 @@ from rtd3jax.config import Config
 Critics = tuple[Params, Params]
 
 SATURATED = 0.99
-"""An action beyond this share of its half range counts as saturated."""
+"""An action beyond this fraction of its half range counts as saturated."""
 
 NORMS_EVERY = 16
-"""Updates of the critics for one measurement of the gradients' norms, which read all parameters."""
+"""Critic updates per measurement of gradient norms, because these read all parameters."""
 
 
 @struct.dataclass
 class TD3State:
-    """Online and target networks, and Adam's moments."""
+    """Online networks, target networks, and Adam's moments."""
 
     actor: Params
     critics: Critics
@@ -44,17 +44,17 @@ class TD3State:
 
 
 _MOMENTUM = 0.9
-# The learning rate is a lane's own number, applied in _descend.
+# The learning rate may differ between lanes; `_descend` applies it.
 _ADAM = optax.scale_by_adam(b1=_MOMENTUM)
 
 
 @dataclasses.dataclass(frozen=True)
 class TD3:
-    """The learner; see `rtd3jax.agents.learners.base.Learner`.
+    """TD3 as a learner; see `rtd3jax.agents.learners.base.Learner`.
 
     Attributes:
         policy_delay: critic updates per update of the actor and the targets.
-        waits: critic updates before the actor's first; the targets follow the critics meanwhile.
+        waits: critic updates before the first actor update; the target critics are updated too.
     """
 
     policy_delay: int = 2
@@ -73,7 +73,7 @@ class TD3:
     )
 
     def init(self, key: jax.Array, networks: Networks) -> TD3State:
-        """A state whose targets equal its online networks."""
+        """The initial state; the target networks equal the online networks."""
         actor_key, first_key, second_key = jax.random.split(key, 3)
         actor = init_network(actor_key, networks.actor)
         critics = (
@@ -99,7 +99,7 @@ class TD3:
         hyperparameters: Hyperparameters,
         count: jax.Array,
     ) -> tuple[TD3State, Metrics]:
-        """The critics' update, and every ``policy_delay``-th time the actor's and the targets'."""
+        """Update the critics, and every ``policy_delay``-th time the actor and the targets."""
         norms = count % NORMS_EVERY == 0
         state, critic = update_critics(networks, state, batch, keys[0], hyperparameters, norms)
         state, actor = lax.cond(
@@ -117,7 +117,7 @@ class TD3:
     def _delayed(
         self, before: TD3State, after: tuple[TD3State, Metrics], count: jax.Array
     ) -> tuple[TD3State, Metrics]:
-        """``after``, with the actor as it was ``before`` while it waits."""
+        """``after``, in which the actor keeps its values ``before`` until its first update."""
         if not self.waits:
             return after
         state, metrics = after
@@ -163,9 +163,9 @@ def target(
 def critic_loss(
     params: Params, critic: Network, batch: Batch, y: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """One critic's mean-squared error against ``y`` [B], and its mean value.
+    """The mean squared error of one critic against ``y`` [B], and the mean of its values.
 
-    The loss is the sum over the two critics.
+    The loss of both critics is the sum of their errors.
     """
     value = _value(critic, params, batch.window, batch.recorded_action, batch.carry)
     error = value - y
@@ -180,18 +180,20 @@ def actor_loss(
     key: jax.Array,
     noise: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """Minus the first critic's mean value of the actor's actions; and the share that is saturated.
+    """The actor's loss, and the fraction of saturated actions.
 
-    With ``noise`` [] > 0 the value is averaged over noise on the actions, and the actor climbs a
-    smoothed action value (Nachum et al., 2018), by one draw for each of the batch: a critic knows
-    the value around where exploration went, while its slope at a single action is mostly kinks.
-    With 0 it is TD3's loss.
+    The loss is the negative mean of the first critic's values of the actor's actions.
+
+    With ``noise`` [] > 0, Gaussian noise is added to each action of the batch, so the actor
+    maximises a smoothed action value (Nachum et al., 2018): the critic has learned values around
+    the explored actions, but its gradient at a single action is irregular. With 0, the loss is
+    TD3's.
     """
     greedy = act(networks.actor, params, batch.window)
     action = add_noise(key, greedy, noise)
     carry = batch.carry
     if carry is None and networks.critic.reads.memory:
-        # No past token depends on the actor: the critic's prefix needs no tape.
+        # The past tokens do not depend on the actor, so no gradient flows into them.
         carry = carry_before(networks.critic, critic_params, batch.window)
     saturated = jnp.mean((jnp.abs(greedy) > SATURATED).astype(jnp.float32))
     value = _value(networks.critic, critic_params, batch.window, action, carry)
@@ -206,10 +208,10 @@ def update_critics(
     hyperparameters: Hyperparameters,
     norms: jax.Array,
 ) -> tuple[TD3State, Metrics]:
-    """One Adam step of both critics; ``norms`` bool [], whether to measure the gradient's norm."""
+    """One Adam step of both critics; ``norms`` bool []: whether to measure the gradient norms."""
     y = target(networks, state, batch, key, hyperparameters)
     pair = jax.tree.map(lambda *leaves: jnp.stack(leaves), *state.critics)
-    # One after the other, so that one tape is alive at a time: two do not fit in a CPU's cache.
+    # One critic after the other: the intermediate values of both do not fit in a CPU's cache.
     (losses, values), gradients = lax.map(
         lambda params: jax.value_and_grad(critic_loss, has_aux=True)(
             params, networks.critic, batch, y
@@ -261,7 +263,7 @@ def update_actor_and_targets(
         target_actor=average(actor, state.target_actor),
         target_critics=average(state.critics, state.target_critics),
     )
-    # A second reader of the gradient would make XLA round Adam's step in another way.
+    # If the norm read the gradient too, XLA would round Adam's step differently.
     norm = _norm_from_moments(norms, before, optimizer.mu)
     found = measured(loss), measured(saturated), norm
     return state, dict(zip(ACTOR_METRICS, found, strict=True))
@@ -272,7 +274,7 @@ def _value(critic: Network, params: Params, history: History, action, carry) -> 
 
 
 def _norm(wanted: jax.Array, gradient: Params) -> Measured:
-    """The Euclidean norm of all of ``gradient``, where it is ``wanted``."""
+    """The Euclidean norm of the whole ``gradient``, if it is ``wanted``."""
     return lax.cond(wanted, lambda: measured(optax.tree.norm(gradient)), not_measured)
 
 
@@ -288,6 +290,6 @@ def _norm_from_moments(wanted: jax.Array, before: Params, after: Params) -> Meas
 
 
 def _descend(params, gradient, optimizer, learning_rate):
-    with jax.numpy_dtype_promotion("standard"):  # optax relies on it
+    with jax.numpy_dtype_promotion("standard"):  # optax needs standard promotion
         direction, optimizer = _ADAM.update(gradient, optimizer)
     return jax.tree.map(lambda p, d: p - learning_rate * d, params, direction), optimizer

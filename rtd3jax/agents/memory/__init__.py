@@ -1,4 +1,4 @@
-"""Memories: what carries the past from token to token in a recurrent agent."""
+"""Memories: the recurrent cells of the agents."""
 
 from rtd3jax.agents.memory.base import Memory, check_memory, register_memory
 from rtd3jax.agents.memory.gru import GRU

@@ -1,4 +1,4 @@
-"""`Memory`: the interface of a recurrent cell, and the table of those that there are.
+"""`Memory`: the interface of recurrent cells, and their registration.
 
 Shapes: ``T`` tokens, ``B`` batch, ``I`` inputs, ``H`` width. Time comes first.
 """
@@ -15,17 +15,19 @@ from rtd3jax.registries import MEMORIES
 
 Params = dict[str, Any]
 Carry = Any
-"""A pytree of float32 arrays [B, ...]; zeros before an episode's first token."""
+"""A pytree of float32 arrays [B, ...]; zeros before the first token of an episode."""
 
 
 class Memory(nn.Module):
-    """A recurrent cell. A memory of your own needs `zero` and `step`, and `read` where the output
-    is not the carry itself; the rest follows.
+    """A recurrent cell.
+
+    A subclass must define `zero` and `step`, and also `read` if its output is not the carry. The
+    other methods have defaults.
 
     Attributes:
         inputs: I.
         width: H.
-        precision: of the factors of wide products; see `rtd3jax.agents.products`.
+        precision: precision of the factors of large products; see `rtd3jax.agents.products`.
     """
 
     inputs: int
@@ -41,18 +43,18 @@ class Memory(nn.Module):
         raise NotImplementedError
 
     def read(self, carry: Carry) -> jax.Array:
-        """What the memory puts out: [B, H]. Zeros for a carry of zeros."""
+        """The output of the memory: [B, H]; zeros for a carry of zeros."""
         return carry
 
     def carries(self, carry: Carry | None, tokens: jax.Array, starts: jax.Array) -> Carry:
         """The carries after each token: arrays [T, B, ...].
 
         Args:
-            carry: before the first token; None for zeros.
+            carry: the carry before the first token; None for zeros.
             tokens: [T, B, I].
-            starts: bool [T, B], tokens that begin an episode: the carry is zero before them.
+            starts: bool [T, B], the first tokens of episodes; the carry is zero before them.
         """
-        # A module's parameters may not be read inside a transformation that began outside it.
+        # flax does not allow a module to read its parameters inside JAX's scan.
         cell, variables = self.clone(parent=None), self.variables
 
         def step(carry: Carry, x: tuple[jax.Array, jax.Array]) -> tuple[Carry, Carry]:
@@ -77,9 +79,9 @@ class Memory(nn.Module):
         """The carry after all tokens of a window.
 
         Args:
-            carry: before the first token; None for zeros.
+            carry: the carry before the first token; None for zeros.
             tokens: [T, B, I].
-            exists: bool [T, B]. The tokens that exist are the last ones; the others leave no trace.
+            exists: bool [T, B]. The existing tokens are the last ones; the others have no effect.
         """
         first = exists & ~jnp.concatenate((jnp.zeros_like(exists[:1]), exists[:-1]))
         starts = first if carry is None else jnp.zeros_like(exists)
@@ -88,15 +90,15 @@ class Memory(nn.Module):
         return jax.tree.map(lambda new, old: _where(exists[-1], new, old), after, before)
 
     def initial(self, key: jax.Array) -> Params:
-        """Parameters at the start of training."""
+        """Initial parameters."""
         carry, token = self.zero(1), jnp.zeros((1, self.inputs), jnp.float32)
         variables = self.init(key, carry, token, method=lambda m, c, x: m.read(m.step(c, x)))
         return variables.get("params", {})
 
     def operations(self) -> tuple[float, float]:
-        """Floating-point operations of a token's wide products: of its input, of the carry.
+        """Floating-point operations per token of the products with the input, and with the carry.
 
-        By default those of dense products with all parameters.
+        The default counts dense products with all parameters.
         """
         params = jax.eval_shape(self.initial, jax.random.key(0))
         wide = [leaf.size for leaf in jax.tree.leaves(params) if leaf.ndim > 1]
@@ -104,12 +106,12 @@ class Memory(nn.Module):
 
 
 def register_memory(name: str, module: type[Memory], *, replace: bool = False) -> None:
-    """Add a memory, which ``Config(memory=name)`` then chooses.
+    """Register a memory, for ``Config(memory=name)``.
 
     Args:
-        name: by which the configuration and saved files know it.
+        name: the name in the configuration and in saved files.
         module: a subclass of `Memory`.
-        replace: whether it may take the place of another of that name.
+        replace: whether it may replace a memory of the same name.
 
     Raises:
         UserError: when the name is taken or ``module`` is not a subclass of `Memory`.
@@ -120,20 +122,20 @@ def register_memory(name: str, module: type[Memory], *, replace: bool = False) -
 
 
 def check_memory(name: str, memory: Memory) -> None:
-    """Raise UserError, before anything is compiled, unless the memory keeps to its interface."""
+    """Raise UserError, before anything is compiled, if the memory violates its interface."""
     batch = 2
 
     def trace(what: str, call: Any, *arguments: Any) -> Any:
         try:
             return jax.eval_shape(call, *arguments)
-        except Exception as error:  # the user's own code, which may raise anything
+        except Exception as error:  # code of a user, which may raise any error
             raise UserError(f"memory {name!r} failed in {what}: {first_line(error)}") from error
 
     carry = trace("zero", lambda: memory.zero(batch))
     for leaf in jax.tree.leaves(carry):
         if leaf.shape[:1] != (batch,) or leaf.dtype != jnp.float32:
             raise UserError(
-                f"memory {name!r}: zero(batch) must give float32 arrays [batch, ...], not "
+                f"memory {name!r}: zero(batch) must return float32 arrays [batch, ...], not "
                 f"{leaf.dtype}{list(leaf.shape)} for a batch of {batch}"
             )
     params = trace("step", memory.initial, jax.ShapeDtypeStruct((), jax.random.key(0).dtype))
@@ -145,20 +147,20 @@ def check_memory(name: str, memory: Memory) -> None:
     after = trace("step", lambda p, c, x: apply(p, "step", c, x), params, carry, token)
     if _shapes(after) != _shapes(carry):
         raise UserError(
-            f"memory {name!r}: step must give a carry like zero's, {_shapes(carry)[1]}, "
+            f"memory {name!r}: step must return a carry like zero's, {_shapes(carry)[1]}, "
             f"not {_shapes(after)[1]}"
         )
     output = trace("read", lambda p, c: apply(p, "read", c), params, carry)
     if getattr(output, "shape", None) != (batch, memory.width) or output.dtype != jnp.float32:
         raise UserError(
-            f"memory {name!r}: read must give float32 [batch, {memory.width}], "
+            f"memory {name!r}: read must return float32 [batch, {memory.width}], "
             f"not {getattr(output, 'dtype', type(output).__name__)}"
             f"{list(getattr(output, 'shape', []))} for a batch of {batch}"
         )
 
 
 def draw_uniform(key: jax.Array, shapes: dict[str, tuple[int, ...]], bound: float) -> Params:
-    """Arrays of these shapes, uniform in ±``bound``; ``key`` is consumed here."""
+    """Arrays of these shapes, uniform in ±``bound``; consumes ``key``."""
     keys = jax.random.split(key, len(shapes))
     return {
         name: jax.random.uniform(k, shape, jnp.float32, -bound, bound)
@@ -172,5 +174,5 @@ def _shapes(tree: object) -> tuple[Any, list[str]]:
 
 
 def _where(there: jax.Array, new: jax.Array, old: jax.Array) -> jax.Array:
-    """``new`` where the token exists: [B, ...]."""
+    """[B, ...]: ``new`` for tokens that exist, ``old`` for the others."""
     return jnp.where(there.reshape(-1, *[1] * (new.ndim - 1)), new, old)

@@ -1,4 +1,4 @@
-"""A gated recurrent unit (Cho et al., 2014), in the form whose reset gate acts on the product.
+"""A gated recurrent unit (Cho et al., 2014); the reset gate acts on the product with the carry.
 
 Shapes: ``T`` tokens, ``B`` batch, ``I`` inputs, ``H`` width.
 """
@@ -12,7 +12,7 @@ from rtd3jax.agents.products import matmul
 
 
 class GRU(Memory):
-    """Gates in the order reset, update, candidate. The carry [B, H] is the output."""
+    """A GRU; its gates have the order reset, update, candidate. The carry [B, H] is the output."""
 
     def setup(self) -> None:
         names = ("input_kernel", "recurrent_kernel", "input_bias", "recurrent_bias")
@@ -40,7 +40,7 @@ class GRU(Memory):
         return self._cell(carry, self._project(token))
 
     def carries(self, carry: jax.Array | None, tokens: jax.Array, starts: jax.Array) -> jax.Array:
-        """The carries after each token, [T, B, H]; the inputs' product is taken once for all."""
+        """The carries after each token, [T, B, H]; one product serves the inputs of all tokens."""
         flat = tokens.reshape(-1, tokens.shape[-1])
         projected = self._project(flat).reshape(*tokens.shape[:2], -1)
 
@@ -53,7 +53,7 @@ class GRU(Memory):
         return lax.scan(step, start, (projected, starts))[1]
 
     def operations(self) -> tuple[float, float]:
-        """Of the input's product and of the carry's."""
+        """Operations of the products with the input and with the carry."""
         return 6.0 * self.inputs * self.width, 6.0 * self.width * self.width
 
     def _project(self, token: jax.Array) -> jax.Array:

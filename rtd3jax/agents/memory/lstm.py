@@ -1,11 +1,11 @@
-"""An LSTM over a masked window, with its gradient written by hand.
+"""An LSTM over a masked window, with a hand-written gradient.
 
 Shapes: ``T`` tokens, ``B`` batch, ``I`` inputs, ``H`` width. Time comes first.
 
-Two things make it fast on a CPU: the input's product is taken for all tokens at once, before the
-scan; and the backward scan carries only the gradient of the carry and emits the gates' gradients,
-so that each weight's gradient is one large product after it. `reference` is the obvious version
-that the tests compare with.
+Two measures make it fast on a CPU. Before the scan, one product serves the inputs of all tokens.
+The backward scan only propagates the gradient of the carry and returns the gradients of the gates,
+so that the gradient of each weight is one large product after the scan. The tests compare with the
+straightforward `reference`.
 """
 
 import functools
@@ -29,7 +29,7 @@ class Carry(NamedTuple):
 
 
 def init_lstm(key: jax.Array, inputs: int, width: int) -> Params:
-    """Parameters, uniform in ±1/sqrt(width), with two bias vectors. Gates stand as i, f, g, o."""
+    """Parameters, uniform in ±1/sqrt(width), with two bias vectors; gate order i, f, g, o."""
     shapes = {
         "input_kernel": (inputs, 4 * width),
         "recurrent_kernel": (width, 4 * width),
@@ -52,7 +52,7 @@ class LSTM(Memory):
     """The LSTM as a memory: two bias vectors, gates in the order i, f, g, o."""
 
     def setup(self) -> None:
-        # Named as in files; `initial` draws all of them from one key.
+        # The names are those in files; `initial` draws all parameters from one key.
         self.kernels = {
             name: self.param(name, lambda key, name=name: self.initial(key)[name])
             for name in _ARRAYS
@@ -88,7 +88,7 @@ class LSTM(Memory):
         return lstm(self.kernels, tokens, exists, carry, self.precision)
 
     def operations(self) -> tuple[float, float]:
-        """Of the input's product and of the hidden state's."""
+        """Operations of the products with the input and with the hidden state."""
         return 8.0 * self.inputs * self.width, 8.0 * self.width * self.width
 
 
@@ -102,18 +102,18 @@ def lstm(
     """The carry after all tokens.
 
     Args:
-        params: of `init_lstm`.
+        params: parameters from `init_lstm`.
         inputs: [T, B, I].
-        exists: bool [T, B]. A token that does not exist leaves the carry as it was, **provided**
-            that it stands before all that exist and that its carry is zero, as in a window: the
-            candidate is then masked, which keeps a zero carry zero at no cost.
-        carry: what the LSTM starts from; None for zero.
-        precision: of the products' factors; see `rtd3jax.agents.products`.
+        exists: bool [T, B]. A token that does not exist does not change the carry, **provided**
+            that it is before all existing tokens and that its carry is zero, as in a window: only
+            the candidate is masked, which keeps a zero carry zero.
+        carry: the initial carry; None for zero.
+        precision: precision of the products' factors; see `rtd3jax.agents.products`.
     """
     input_kernel, recurrent_kernel = params["input_kernel"], params["recurrent_kernel"]
     bias = params["input_bias"] + params["recurrent_bias"]
     if carry is None:
-        # Without a carry the first token needs no recurrent product: a quarter of all at l = 1.
+        # With a zero carry, the first token needs no recurrent product, a quarter of all at l = 1.
         gates = matmul(inputs[0], input_kernel, precision) + bias[None, :]
         nothing = zero_carry(inputs.shape[1], recurrent_kernel.shape[0]).cell
         carry = _cell(_activate(gates, exists[0]), nothing.astype(gates.dtype))
@@ -133,11 +133,11 @@ def lstm_carries(
     """The carries after each token, [T, B, H], with a hand-written gradient.
 
     Args:
-        params: of `init_lstm`.
+        params: parameters from `init_lstm`.
         inputs: [T, B, I].
         starts: bool [T, B], tokens before which the carry is set to zero.
-        carry: [B, H], before the first token.
-        precision: of the products' factors.
+        carry: [B, H], the carry before the first token.
+        precision: precision of the products' factors.
     """
     bias = params["input_bias"] + params["recurrent_bias"]
     kernels = params["input_kernel"], params["recurrent_kernel"]
@@ -145,7 +145,7 @@ def lstm_carries(
 
 
 def reference(params: Params, inputs: jax.Array, exists: jax.Array, carry: Carry) -> Carry:
-    """`lstm` as one would write it down; for the tests."""
+    """A straightforward version of `lstm`, for the tests."""
     for x, there in zip(inputs, exists, strict=True):
         gates = x @ params["input_kernel"] + carry.hidden @ params["recurrent_kernel"]
         gates = gates + (params["input_bias"] + params["recurrent_bias"])[None, :]
@@ -163,10 +163,11 @@ def _project(input_kernel: jax.Array, bias: jax.Array, inputs: jax.Array) -> jax
 
 
 def _activate(gates: jax.Array, exists: jax.Array):
-    """i, f, g, o [B, H] each from the gates' sums [B, 4H], the candidate g masked.
+    """The activations i, f, g and o, [B, H] each, of the sums [B, 4H]; the candidate g is masked.
 
-    One tanh for all four, as ``sigmoid(x) = tanh(x/2)/2 + 1/2``, and a barrier after it: XLA's CPU
-    backend does not vectorise a tanh that is fused with slices, and takes five times as long.
+    A single tanh computes all four, because ``sigmoid(x) = tanh(x/2)/2 + 1/2``. A barrier follows:
+    XLA's CPU backend does not vectorise a tanh that is fused with slices, which then takes five
+    times as long.
     """
     width = gates.shape[-1] // 4
     half, one = jnp.full((width,), 0.5, gates.dtype), jnp.ones((width,), gates.dtype)
@@ -207,8 +208,8 @@ def _forward(precision, input_kernel, recurrent_kernel, bias, inputs, exists, ca
         gates, there = x
         recurrent = product(narrow(carry.hidden, precision), recurrent_kernel)
         activations = _activate(gates + recurrent, there)
-        # Stacked in float32: XLA's CPU backend writes into a stack of bfloat16 by converting all
-        # of it, there and back, at every token.
+        # Stacked in float32: for a stack of bfloat16, XLA's CPU backend converts the whole stack to
+        # float32 and back at every token.
         return _cell(activations, carry.cell), (carry, activations)
 
     end, (before, activations) = lax.scan(token, carry, (projected, exists))
@@ -242,7 +243,7 @@ _lstm.defvjp(_forward, _backward)
 
 
 def _sums(precision, residuals, d_gates: jax.Array):
-    """Gradients of kernels, bias and inputs from those of the gates [T, B, 4H]: large products."""
+    """Gradients of kernels, bias and inputs, from the gradients of the gates [T, B, 4H]."""
     input_kernel, _, inputs, _, before, _ = residuals
     d_bias = d_gates.sum(axis=(0, 1))
     d_gates = narrow(d_gates, precision)
@@ -310,5 +311,5 @@ _carries.defvjp(_carries_forward, _carries_backward)
 
 
 def _reset(carry: Carry, begins: jax.Array) -> Carry:
-    """``carry`` [B, H], zero where an episode ``begins`` [B]."""
+    """``carry`` [B, H], set to zero at the entries where an episode ``begins`` [B]."""
     return Carry(*(jnp.where(begins[:, None], jnp.zeros_like(part), part) for part in carry))

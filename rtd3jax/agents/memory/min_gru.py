@@ -1,7 +1,7 @@
 """A minimal gated recurrent unit (Feng et al., 2024), scanned in parallel.
 
-Neither its gate nor its candidate reads the carry, so the carry is a linear recurrence,
-``h_t = (1 - z_t) h_{t-1} + z_t n_t``, and all tokens' carries follow from one associative scan.
+Neither the gate nor the candidate reads the carry, so the carry follows a linear recurrence,
+``h_t = (1 - z_t) h_{t-1} + z_t n_t``, and one associative scan computes the carries of all tokens.
 Shapes: ``T`` tokens, ``B`` batch, ``I`` inputs, ``H`` width.
 """
 
@@ -14,7 +14,7 @@ from rtd3jax.agents.products import matmul
 
 
 class MinGRU(Memory):
-    """Gate, then candidate. The carry [B, H] is the output."""
+    """A minimal GRU; gate order: gate, candidate. The carry [B, H] is the output."""
 
     def setup(self) -> None:
         self.kernels = {
@@ -33,7 +33,7 @@ class MinGRU(Memory):
         return jnp.zeros((batch, self.width), jnp.float32)
 
     def step(self, carry: jax.Array, token: jax.Array) -> jax.Array:
-        """``(1 - z) h + z n`` with ``z`` and ``n`` of the token [B, I] alone."""
+        """``(1 - z) h + z n``, where ``z`` and ``n`` only depend on the token [B, I]."""
         keep, add = self._terms(token)
         return keep * carry + add
 
@@ -50,7 +50,7 @@ class MinGRU(Memory):
         return added if carry is None else kept * carry[None] + added
 
     def operations(self) -> tuple[float, float]:
-        """Of the input's product; no product reads the carry."""
+        """Operations of the product with the input; there is no product with the carry."""
         return 4.0 * self.inputs * self.width, 0.0
 
     def _terms(self, token: jax.Array) -> tuple[jax.Array, jax.Array]:
