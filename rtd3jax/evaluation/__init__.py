@@ -1,1 +1,1 @@
-"""Whole episodes of a policy in an environment, and the best return that there can be."""
+"""Evaluation of policies in whole episodes, and the best possible return."""

@@ -1,4 +1,4 @@
-"""The best possible return of an environment, which no trained agent exceeds on average."""
+"""The best possible mean return of an environment."""
 
 import numpy as np
 
@@ -13,15 +13,15 @@ from rtd3jax.protocols import EnvironmentLike
 def ceiling(
     env: EnvironmentLike, episodes: int = 20_000, seed: int = 0, *, env_id: str | None = None
 ) -> Ceiling:
-    """The best possible mean return of ``env``, or an upper bound that is named as such.
+    """The best possible mean return of ``env``, or an upper bound; ``kind`` states which.
 
     Args:
-        env: an environment that was registered with a ceiling, as the rover and the pendulum are;
-            disturbed or not.
-        episodes: how many to average where the ceiling is the mean of random episodes. The
-            pendulum's is an integral over all starts and needs none.
-        seed: of these episodes.
-        env_id: the id under which it was registered; by default that of an equal environment.
+        env: an environment that was registered with a ceiling, such as the rover and the pendulum;
+            it may be disturbed.
+        episodes: number of episodes, if the ceiling is a mean over random episodes. The pendulum's
+            ceiling is an integral over all starts, which needs none.
+        seed: seed of these episodes.
+        env_id: the id of the environment; by default the id of an equal environment.
 
     Raises:
         UserError: for an environment whose ceiling is not known.
@@ -29,12 +29,14 @@ def ceiling(
     best_return = description_of(env, env_id).ceiling
     name = environment_name(env)
     if best_return is None:
-        raise UserError(f"no ceiling of {name} is known: rtd.register(..., ceiling=...) tells one")
+        raise UserError(
+            f"the ceiling of {name} is not known: pass one to rtd.register(..., ceiling=...)"
+        )
     try:
         best = best_return(env, episodes, seed)
     except UserError:
         raise
-    except Exception as error:  # a user's function may do anything
+    except Exception as error:  # a user's function may raise any error
         raise UserError(f"the ceiling of {name} failed: {first_line(error)}") from error
     if isinstance(best, Ceiling):
         return best

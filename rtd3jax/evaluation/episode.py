@@ -1,4 +1,4 @@
-"""Episodes of a policy, step by step: to look at, to plot, to put in a table."""
+"""Plays episodes of a policy and keeps every step, for plots and tables."""
 
 import dataclasses
 import functools
@@ -25,38 +25,39 @@ from rtd3jax.policies.compatibility import check_compatible
 from rtd3jax.protocols import EnvironmentLike, PolicyLike
 from rtd3jax.system.program_cache import make_room
 
-if TYPE_CHECKING:  # with it come a second of imports
+if TYPE_CHECKING:  # importing pandas takes a second
     import pandas as pd
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Episodes as arrays: E episodes, T steps of the longest of them.
+    """Episodes as arrays: E episodes; the longest has T steps.
 
-    What comes after an episode's own end is NaN, or False. Row t of the observations is what there
-    was when action t was chosen; row ``lengths`` is the last one, after which nothing was done.
+    Entries after the end of an episode are NaN or False. Row t of the observations is the
+    observation for which action t was chosen; row ``lengths`` is the final observation.
 
     Attributes:
-        seen: float32 [E, T + 1, O], what the policy saw.
-        true: float32 [E, T + 1, S], the undisturbed observation; NaN in row 0 where the environment
-            does not tell it.
+        seen: float32 [E, T + 1, O], the observations of the policy.
+        true: float32 [E, T + 1, S], the undisturbed observations; NaN in row 0 if the environment
+            does not provide it.
         actions: float32 [E, T, A], flat, in the environment's units.
-        rewards: float32 [E, T], as given.
-        true_rewards: float32 [E, T], of the undisturbed state where the environment tells it.
-        terminated: bool [E, T], the episode ended by itself after this step.
-        truncated: bool [E, T], the time limit was reached after this step.
-        hidden: float32 [E, T, K], what action t met unseen; None where the environment's `Drawing`
-            names no such thing.
-        lengths: int64 [E], steps of each episode.
+        rewards: float32 [E, T], the rewards of the environment.
+        true_rewards: float32 [E, T], rewards of the undisturbed state, if the environment provides
+            them; else the rewards.
+        terminated: bool [E, T], whether the episode terminated after this step.
+        truncated: bool [E, T], whether the time limit was reached after this step.
+        hidden: float32 [E, T, K], the hidden variable during step t; None if the environment's
+            `Drawing` has no hidden variable.
+        lengths: int64 [E], number of steps of each episode.
         action_low: float32 [A], the lowest action.
         action_high: float32 [A], the highest action.
         observation_names: S names of the undisturbed observation's elements.
-        seen_names: O names of the elements that the policy saw.
+        seen_names: O names of the observed elements.
         action_names: A names.
         hidden_names: K names.
-        environment: its name.
-        seed: of the episodes.
-        step_seconds: length of a step in s; None where that is not known.
+        environment: the name of the environment.
+        seed: the seed of the episodes.
+        step_seconds: length of a step in s; None if it is not known.
     """
 
     seen: np.ndarray
@@ -80,17 +81,19 @@ class Trajectory:
 
     @property
     def returns(self) -> np.ndarray:
-        """Sums of the rewards as given, float32 [E]."""
+        """The return of each episode: sums of ``rewards``, float32 [E]."""
         return np.nansum(self.rewards, axis=1)
 
     def to_frame(self) -> "pd.DataFrame":
         """A row for each observation of each episode.
 
-        Columns: ``episode``, ``step``, ``time`` (s, where a step's length is known), ``seen X`` and
-        ``true X`` for each element of the observation, ``action X``, ``reward``, ``true reward``,
-        ``terminated``, ``truncated``, and the names of the hidden signal, such as ``slip left``.
-        The last row of an episode has its last observation, and NaN for the action that nobody
-        chose and all that would have followed from it.
+        Columns: ``episode``, ``step``, ``time`` (s, if the length of a step is known), ``seen X``
+        and ``true X`` for each element of the observation, ``action X``, ``reward``, ``true
+        reward``, ``terminated``, ``truncated``, and the names of the hidden variable, such as
+        ``slip left``.
+
+        The last row of an episode holds the final observation; the other columns are NaN, because
+        no action follows it.
         """
         import pandas as pd
 
@@ -123,22 +126,22 @@ def rollout(
     params: object = None,
     steps: int | None = None,
 ) -> Trajectory:
-    """Play ``episodes`` of ``policy``, and keep every step.
+    """Play episodes of ``policy``, and keep every step.
 
-    They are those of ``rtd.evaluate(policy, env, episodes, seed)``: the same starts and the same
-    disturbances.
+    The episodes are those of ``rtd.evaluate(policy, env, episodes, seed)``: they have the same
+    starts and the same disturbances.
 
     Args:
         policy: anything with ``init`` and ``step``; see `rtd3jax.policies`.
-        env: a gymnax >= 1.0 environment. Names of elements and the hidden signal are those of the
-            `Drawing` with which it was registered.
-        seed: of the environment's streams.
-        episodes: how many, side by side.
-        params: the environment's parameters; its own by default.
-        steps: cut episodes after so many; by default their own time limit.
+        env: a gymnax >= 1.0 environment. The `Drawing` of its registration defines the names of
+            elements and the hidden variable.
+        seed: seed of the environment's random streams.
+        episodes: number of episodes, played together.
+        params: the environment's parameters; its default parameters by default.
+        steps: number of steps after which episodes are cut; by default their time limit.
 
     Raises:
-        UserError: for an unfit environment or impossible arguments.
+        UserError: for an unsuitable environment or impossible arguments.
     """
     params = parameters_of(env, params)
     limit = int(getattr(params, "max_steps_in_episode", DEFAULT_STEP_LIMIT))
@@ -163,14 +166,16 @@ def play_episodes(
     *,
     params: object = None,
 ) -> dict[str, np.ndarray]:
-    """Play ``steps`` of each episode, with ``hidden`` of a `Drawing`: arrays [episodes, ...].
+    """Play ``steps`` steps of each episode, with ``hidden`` of a `Drawing`.
 
-    Observations ``seen`` and ``true`` [E, steps + 1, ...] begin with the first one; ``action``,
-    ``reward``, ``true_reward``, ``terminated``, ``truncated`` and, where there is such a thing,
-    ``hidden`` are [E, steps, ...]. Whatever comes after an episode's end means nothing.
+    Returns:
+        Arrays by name. The observations ``seen`` and ``true`` are [E, steps + 1, ...] and begin
+        with the first observation. ``action``, ``reward``, ``true_reward``, ``terminated``,
+        ``truncated`` and, with a hidden variable, ``hidden`` are [E, steps, ...]. Entries after the
+        end of an episode have no meaning.
 
     Raises:
-        UserError: for an unfit environment, or a policy that does not fit it.
+        UserError: for an unsuitable environment, or a policy that does not fit it.
     """
     params = parameters_of(env, params)
     own = describe(env, params)
@@ -184,7 +189,7 @@ def play_episodes(
 
 @functools.partial(jax.jit, static_argnames=("env", "episodes", "steps", "hidden"))
 def _play(policy, env, params, key, episodes, steps, hidden):
-    # The keys are those of `rtd3jax.evaluation.rollout`, so that the episodes are the same.
+    # The same keys as in `rtd3jax.evaluation.rollout`, so that the episodes are the same.
     policy_key, reset_key, step_key = jax.random.split(key, 3)
     reset_keys = jax.random.split(reset_key, episodes)
     with foreign_code():
@@ -227,7 +232,7 @@ def _play(policy, env, params, key, episodes, steps, hidden):
         return {**frames, "true": frames["seen"]}
     if isinstance(env, Disturbed):
         true, _ = jax.vmap(env.undisturbed_reset, in_axes=(0, None))(reset_keys, params)
-    else:  # an environment that disturbs itself does not say what its first observation hides
+    else:  # the undisturbed first observation of such an environment is not known
         true = jnp.full((episodes, frames["true"].shape[-1]), jnp.nan, jnp.float32)
     frames["true"] = jnp.concatenate([true[:, None], frames["true"]], axis=1)
     return frames
@@ -240,7 +245,7 @@ def _trajectory(
     drawing: Drawing,
     seed: int,
 ) -> Trajectory:
-    """Cut at the longest episode, blank what comes after each one's end, and name the elements."""
+    """Cut at the longest episode, fill with NaN after the end of each, and name the elements."""
     done = played["terminated"] | played["truncated"]
     lengths = np.where(done.any(axis=1), done.argmax(axis=1) + 1, done.shape[1])
     most = int(lengths.max())
@@ -287,18 +292,18 @@ def _trajectory(
 
 
 def element_names(given: tuple[str, ...], letter: str, size: int) -> list[str]:
-    """The names given, if there are as many as elements; else numbered ones."""
+    """The given names if their number equals ``size``; else numbered names."""
     if len(given) == size:
         return list(given)
     return [f"{letter}[{k}]" for k in range(size)]
 
 
 def _named(what: str, names: tuple[str, ...], values: np.ndarray) -> dict[str, np.ndarray]:
-    """Columns of ``values`` [rows, elements] by name."""
+    """The columns of ``values`` [rows, elements] by name."""
     return {f"{what} {name}".strip(): values[:, k] for k, name in enumerate(names)}
 
 
 def _row_more(values: np.ndarray, length: int) -> np.ndarray:
-    """The first ``length`` rows, and one of NaN."""
+    """The first ``length`` rows, and a row of NaN."""
     shape = (1, *values.shape[1:])
     return np.concatenate([values[:length], np.full(shape, np.nan, np.float32)])

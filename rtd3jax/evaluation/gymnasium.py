@@ -1,4 +1,4 @@
-"""Policies that were trained here, in Gymnasium's environments."""
+"""Evaluates policies in Gymnasium's environments."""
 
 from typing import Any
 
@@ -24,14 +24,15 @@ def run_in_gymnasium(
 
     Args:
         policy: anything with ``init`` and ``step``; see `rtd3jax.policies`.
-        gym_env: a ``gymnasium.Env`` with a Box of actions, or the id of one. It is left open if it
-            was given open.
-        episodes: how many, one after the other.
-        seed: of the episodes; the first n of more episodes are those of n episodes.
+        gym_env: a ``gymnasium.Env`` with a Box of actions, or an id. A ``gymnasium.Env`` is not
+            closed at the end.
+        episodes: number of episodes, played one after the other.
+        seed: seed of the episodes; with a larger ``episodes``, the first episodes stay the same.
 
     Raises:
-        UserError: for spaces that do not fit the policy, or impossible arguments; at a step at
-            which an action or a reward is not finite, or the observation for a policy from here.
+        UserError: for spaces that do not fit the policy, or impossible arguments; at a step with an
+            action or a reward that is not finite, or, for a policy of this package, with such an
+            observation.
     """
     if isinstance(episodes, bool) or episodes != int(episodes) or episodes < 1:
         raise UserError(f"episodes must be an integer of at least 1, not {episodes!r}")
@@ -53,7 +54,7 @@ def run_in_gymnasium(
 def _play(policy: PolicyLike, env: gymnasium.Env, episodes: int, seed: int) -> np.ndarray:
     space = _check_spaces(policy, env)
     returns = np.zeros(episodes)
-    # As seeds of their own: neighbouring seeds shall not share episodes.
+    # Each episode gets its own seed, so that neighbouring values of ``seed`` share no episodes.
     for index, episode_seed in enumerate(np.random.SeedSequence(seed).generate_state(episodes)):
         observation, _ = env.reset(seed=int(episode_seed))
         state = policy.init(jax.random.key(int(episode_seed)))
@@ -84,10 +85,10 @@ def _act(policy: PolicyLike, state: object, observation: jax.Array) -> tuple[jax
 
 
 def _check_spaces(policy: PolicyLike, env: gymnasium.Env) -> gymnasium.spaces.Box:
-    """The space of actions; UserError where policy and environment do not fit each other."""
+    """The space of actions; UserError if policy and environment do not fit together."""
     if not isinstance(env, gymnasium.Env):
         raise UserError(
-            f"{type(env).__name__} is not a gymnasium.Env; for a gymnax environment there is "
+            f"{type(env).__name__} is not a gymnasium.Env; for a gymnax environment use "
             "rtd.evaluate"
         )
     actions, observations = env.action_space, env.observation_space

@@ -1,4 +1,4 @@
-"""The picture of an episode: what was true, what was seen, what was done, and what it met."""
+"""Plots an episode: true and seen observations, actions, rewards, and the hidden variable."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -8,16 +8,16 @@ from rtd3jax.errors import UserError
 from rtd3jax.evaluation.episode import Trajectory
 from rtd3jax.evaluation.style import STYLE
 
-if TYPE_CHECKING:  # with it come two seconds of imports
+if TYPE_CHECKING:  # importing matplotlib takes two seconds
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 MOST_PANELS = 6
-"""Elements of observations or of actions with a panel each; more of them share one panel."""
+"""Largest number of elements that get a panel each; more elements share one panel."""
 
 _TRUE, _SEEN, _OTHER = "#222222", "#D55E00", "#0072B2"
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#222222", "#999999")
-"""Of several lines in a panel; told apart by the colour-blind too."""
+"""Colours of the lines in a panel, which colour-blind readers can distinguish."""
 
 _STYLE: Any = {**STYLE, "legend.fontsize": 8.0}
 
@@ -25,18 +25,19 @@ _STYLE: Any = {**STYLE, "legend.fontsize": 8.0}
 def plot_episode(trajectory: Trajectory, episode: int = 0) -> "Figure":
     """Draw one episode of `rtd3jax.rollout`: a panel for each signal, over time.
 
-    The figure is matplotlib's: ``figure.savefig("episode.png")`` keeps it, and a notebook shows it.
+    The figure is a matplotlib figure: ``figure.savefig("episode.png")`` saves it, and a notebook
+    shows it.
 
     Args:
-        trajectory: what `rtd3jax.rollout` returned.
-        episode: which of its episodes.
+        trajectory: the result of `rtd3jax.rollout`.
+        episode: index of the episode.
 
     Raises:
-        UserError: for what is no trajectory, or an episode that it does not have.
+        UserError: for another type of ``trajectory``, or an index that it does not have.
     """
     if not isinstance(trajectory, Trajectory):
         raise UserError(
-            f"plot_episode draws what rtd.rollout returns, not {type(trajectory).__name__}"
+            f"plot_episode needs the result of rtd.rollout, not {type(trajectory).__name__}"
         )
     count = len(trajectory.lengths)
     if isinstance(episode, bool) or episode != int(episode) or not 0 <= episode < count:
@@ -51,7 +52,7 @@ def plot_episode(trajectory: Trajectory, episode: int = 0) -> "Figure":
         for axis, (kind, elements) in zip(axes, panels, strict=True):
             _draw(axis, kind, elements, trajectory, int(episode))
             if axis.get_legend_handles_labels()[1]:
-                # Beside the panel, where it cannot hide a line.
+                # Next to the panel, where it cannot hide a line.
                 axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.05))
         known = trajectory.step_seconds is not None
         axes[-1].set_xlabel("time in s" if known else "step")
@@ -68,7 +69,7 @@ def plot_episode(trajectory: Trajectory, episode: int = 0) -> "Figure":
 
 
 def _panels(trajectory: Trajectory) -> list[tuple[str, list[int]]]:
-    """What each panel shows, from top to bottom: a kind, and the elements of that kind."""
+    """The panels from top to bottom: for each, a kind and the elements of this kind."""
     panels: list[tuple[str, list[int]]] = []
     for kind, names in (
         ("observation", trajectory.observation_names),
@@ -105,7 +106,7 @@ def _draw(
     for place, k in enumerate(elements):
         axis.step(
             times,
-            # An action holds for its whole step, the last one too.
+            # An action is constant during its step; this includes the last action.
             np.append(values[:length, k], values[length - 1, k]),
             where="post",
             color=_OTHER if single else _COLOURS[place % len(_COLOURS)],
@@ -124,7 +125,7 @@ def _draw_observation(
         axis.set_ylabel("observation")
         for place, k in enumerate(elements):
             colour = _COLOURS[place % len(_COLOURS)]
-            # Two columns of eight names are as much as there is room for.
+            # There is only space for two columns of eight names.
             label = names[k] if place < len(_COLOURS) else None
             axis.plot(times, true[:, k], color=colour, linewidth=1.0, label=label)
         return
@@ -142,7 +143,7 @@ def _draw_observation(
 
 
 def _draw_bounds(axis: "Axes", values: np.ndarray, trajectory: Trajectory, k: int) -> None:
-    """The bounds of an action, where it comes near one: elsewhere they would squash it."""
+    """Draw a bound if the action comes near it; otherwise it would compress the curve."""
     low, high = float(trajectory.action_low[k]), float(trajectory.action_high[k])
     for bound, near in ((low, values.min() - low), (high, high - values.max())):
         if near < 0.05 * (high - low):

@@ -1,4 +1,4 @@
-"""Deterministic evaluation of any policy on any environment."""
+"""Evaluates any policy in any environment; equal seeds give equal episodes."""
 
 import functools
 
@@ -28,13 +28,15 @@ def evaluate(
     Args:
         policy: anything with ``init`` and ``step``; see `rtd3jax.policies`.
         env: a gymnax >= 1.0 environment.
-        episodes: how many, side by side.
-        seed: of the environment's streams; equal seeds meet equal episodes, whatever the policy.
-        params: the environment's parameters; its own by default.
-        true_reward: count the reward of the undisturbed state, where the environment gives it.
+        episodes: number of episodes, played together.
+        seed: seed of the environment's random streams; equal seeds give equal starts and
+            disturbances for all policies.
+        params: the environment's parameters; its default parameters by default.
+        true_reward: whether to sum the rewards of the undisturbed state, if the environment
+            provides them.
 
     Raises:
-        UserError: for an unfit environment or impossible arguments.
+        UserError: for an unsuitable environment or impossible arguments.
     """
     returns, true_returns = both_returns(policy, env, episodes, seed, params=params)
     return true_returns if true_reward else returns
@@ -43,9 +45,9 @@ def evaluate(
 def both_returns(
     policy: PolicyLike, env: EnvironmentLike, episodes: int, seed: int, *, params: object = None
 ) -> tuple[jax.Array, jax.Array]:
-    """Returns of the reward as given and of the true state's, from the same episodes.
+    """The returns and the returns of the undisturbed state, from the same episodes.
 
-    As `evaluate`, which gives one of the two: float32 [episodes] each.
+    Both are float32 [episodes]; `evaluate` returns one of the two.
     """
     for name, value, low in (("episodes", episodes, 1), ("seed", seed, 0)):
         if isinstance(value, bool) or value != int(value) or not low <= value < 2**32:
@@ -72,7 +74,7 @@ def _episode_returns(policy, env, params, key, episodes):
 def episode_returns(
     policy: PolicyLike, env: EnvironmentLike, params: object, key: jax.Array, episodes: int
 ) -> tuple[jax.Array, jax.Array]:
-    """Returns of the trained and of the true reward, float32 [episodes] each; for use under jit."""
+    """As `both_returns`, float32 [episodes] each, without checks; for use under jit."""
     policy_key, reset_key, step_key = jax.random.split(key, 3)
     with foreign_code():
         observation, env_state = jax.vmap(env.reset, in_axes=(0, None))(

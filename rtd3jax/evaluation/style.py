@@ -1,4 +1,4 @@
-"""How our pictures look: matplotlib's settings, of which nothing is imported here."""
+"""matplotlib's settings for all figures; this module does not import matplotlib."""
 
 from typing import Any
 

@@ -1,1 +1,1 @@
-"""From one lane to many."""
+"""Training: the loop of one lane, and the distribution of lanes over cores and devices."""

@@ -1,9 +1,9 @@
-"""Checkpoints of lanes: everything that a lane is, so that it goes on to the bit.
+"""Checkpoints of lanes, from which training continues with bit-identical results.
 
-A lane's checkpoint is one file, written beside its place and moved there, with a checksum; the
-last two are kept. It is a safetensors file: reading it cannot run code. A lane has no hidden
-state: its random numbers are a function of seed and step, and how its steps are cut into chunks
-is immaterial, so a lane that goes on from a checkpoint ends with the same bits.
+A checkpoint of a lane is one safetensors file with a checksum; reading it cannot run code. The file
+is written under a temporary name and then renamed, and the last two are kept. A lane has no state
+outside the checkpoint: its random numbers are a function of seed and step, and the division of its
+steps into chunks has no effect. So a lane that continues from a checkpoint ends with the same bits.
 """
 
 import hashlib
@@ -25,30 +25,31 @@ from rtd3jax.system.versions import versions_of
 from rtd3jax.training.loop import Lane, LaneState, Program
 
 DEFAULT_SECONDS = 300.0
-"""Between checkpoints of a lane, unless they are so large that they take their time."""
+"""Default time between two checkpoints of a lane; longer if writing one takes long."""
 
 _PATIENCE = 150
-"""A checkpoint waits by default for this many times what the last one took: with five lanes on two
-cores they cost 2% at most, however large the replay."""
+"""By default, the time between checkpoints is at least this many times the time that the last one
+took. With five lanes on two cores, checkpoints then take at most 2% of the time."""
 
 MOST_NUMBERS = 1_000
-"""Of an array that a checkpoint's identity spells out."""
+"""Numbers of an array that the identity of a checkpoint contains; of a longer one, a digest."""
 
 KEPT = 2
 LONGER = ("total_steps", "replay_capacity")
-"""Fields of the configuration that may grow, and a lane goes on from its checkpoint."""
+"""Fields of the configuration that may increase when a lane continues from its checkpoint."""
 _FORMAT = 1
 
 
 class Checkpoints:
-    """Where lanes keep their checkpoints, and how often.
+    """Writes and reads the checkpoints of lanes.
 
     Args:
-        directory_of: a lane's own directory.
-        identity_of: what the lane is, JSON-ready; a checkpoint of something else is refused.
-        seconds: between checkpoints of a lane; None for `DEFAULT_SECONDS`, or longer where a
-            checkpoint takes long; infinity for none by time.
-        steps: between checkpoints of a lane; None for none by steps.
+        directory_of: returns the directory of a lane.
+        identity_of: returns the identity of a lane, JSON-ready; a checkpoint with another identity
+            is refused.
+        seconds: time between two checkpoints of a lane; None for `DEFAULT_SECONDS`, or longer if a
+            checkpoint takes long; infinity for no limit of time.
+        steps: steps between two checkpoints of a lane; None for no limit of steps.
     """
 
     def __init__(
@@ -66,7 +67,7 @@ class Checkpoints:
         self._cost: dict[int, float] = {}
 
     def is_due(self, group: Any) -> bool:
-        """Whether the group's last checkpoint, or its start, is long enough ago."""
+        """Whether the group needs a new checkpoint."""
         now = time.monotonic()
         when, step = self._written.setdefault(id(group), (now, 0))
         seconds = self._seconds
@@ -78,7 +79,7 @@ class Checkpoints:
     def save(
         self, jobs: Iterable[tuple[Any, LaneState]], group: Any, step: int, kept: int = KEPT
     ) -> None:
-        """Write a checkpoint of each lane at ``step``, then drop those before the last ``kept``."""
+        """Write a checkpoint of each lane at ``step``; then remove all but the last ``kept``."""
         began = time.monotonic()
         for job, state in jobs:
             directory = self._directory_of(job)
@@ -94,7 +95,7 @@ class Checkpoints:
             except OSError as error:
                 raise UserError(
                     f"checkpoint in {directory} cannot be written: {error.strerror}; "
-                    "the one before it is kept"
+                    "the previous checkpoint is kept"
                 ) from error
             for old in [*checkpoint_files(directory)[kept:], *_unfinished(directory)]:
                 old.unlink(missing_ok=True)
@@ -103,18 +104,20 @@ class Checkpoints:
         self._cost[id(group)] = now - began
 
     def restore(self, jobs: list[Any]) -> tuple[list[LaneState], int] | None:
-        """The newest step at which all these lanes have a sound checkpoint; None for a new start.
+        """The states at the newest step with a valid checkpoint of every lane, and this step.
+
+        Returns None if the lanes must start from the beginning.
 
         Raises:
-            UserError: when a checkpoint belongs to something else, or none of those there is sound.
+            UserError: when a checkpoint has another identity, or no checkpoint is valid.
         """
         found = [self._readable(job, first=len(jobs) == 1) for job in jobs]
         common = set.intersection(*(set(steps) for steps in found))
         if not common:
             if any(found):
                 warnings.warn(
-                    "lanes that now advance together have no checkpoint of a common step: "
-                    "they start over",
+                    "lanes that now advance together have no checkpoint at a common step: "
+                    "they start from the beginning",
                     stacklevel=2,
                 )
             return None
@@ -122,11 +125,11 @@ class Checkpoints:
         return [steps[step] for steps in found], step
 
     def newest(self, job: Any) -> int:
-        """The step of a lane's newest checkpoint, sound or not; 0 without one."""
+        """The step of a lane's newest checkpoint, valid or not; 0 without a checkpoint."""
         return max(checkpoint_steps(self._directory_of(job)), default=0)
 
     def discard(self, job: Any) -> None:
-        """Remove a lane's checkpoints: it has ended, and its result is kept."""
+        """Remove the checkpoints of a lane that has ended and whose result is saved."""
         directory = self._directory_of(job)
         for file in [*checkpoint_files(directory), *_unfinished(directory)]:
             file.unlink(missing_ok=True)
@@ -134,7 +137,7 @@ class Checkpoints:
             directory.rmdir()
 
     def _readable(self, job: Any, first: bool) -> dict[int, LaneState]:
-        """A lane's sound checkpoints by step, or the newest one; warns of damaged ones."""
+        """A lane's valid checkpoints by step, or only the newest; warns of damaged ones."""
         states, complaints = {}, []
         for file in checkpoint_files(self._directory_of(job)):
             try:
@@ -150,15 +153,15 @@ class Checkpoints:
                 break
         if complaints and not states:
             raise UserError(
-                f"{'; '.join(complaints)}; no older checkpoint is left: remove "
-                f"{self._directory_of(job)} to start this lane over"
+                f"{'; '.join(complaints)}; there is no older checkpoint: remove "
+                f"{self._directory_of(job)} to start this lane from the beginning"
             )
         for complaint in complaints:
             warnings.warn(f"{complaint}; an older checkpoint is used", stacklevel=2)
         return states
 
     def _check(self, file: Path, metadata: Any, job: Any) -> bool:
-        """See that a checkpoint is of this lane; whether the lane has more steps now."""
+        """Check the identity of a checkpoint; return whether the lane has more steps now."""
         here: dict[str, Any] = {
             "format": _FORMAT,
             "identity": self._identity_of(job),
@@ -169,19 +172,21 @@ class Checkpoints:
         if longer:
             reason = why_not_longer(there["identity"], here["identity"], int(there["step"]))
             if reason is not None:
-                raise UserError(f"{file} cannot go on to more steps: {reason}; start over")
+                raise UserError(
+                    f"{file} cannot continue to more steps: {reason}; start from the beginning"
+                )
             del here["identity"]
         for name, value in here.items():
             if there.get(name) != value:
                 raise UserError(
-                    f"{file} is of another {name} ({_difference(there.get(name), value)}); "
-                    "use what made it, or start over"
+                    f"{file} belongs to another {name} ({_difference(there.get(name), value)}); "
+                    f"use the same {name}, or start from the beginning"
                 )
         return longer
 
 
 def is_longer(before: Any, after: Mapping[str, Any]) -> bool:
-    """Whether ``after`` (a lane's identity) is ``before`` with more steps."""
+    """Whether ``after``, the identity of a lane, equals ``before`` except for more steps."""
     if not isinstance(before, dict) or before.keys() != after.keys():
         return False
     changed = {name for name in after if before[name] != after[name]}
@@ -193,15 +198,15 @@ def is_longer(before: Any, after: Mapping[str, Any]) -> bool:
 
 
 def why_not_longer(before: Mapping[str, Any], after: Mapping[str, Any], step: int) -> str | None:
-    """Why a lane that did ``step`` steps cannot go on as if it had been meant to do more.
+    """Why a lane cannot continue to more steps with the results of an uninterrupted training.
 
     Args:
-        before: the configuration with which it did them.
+        before: the configuration of the steps so far.
         after: the configuration with more steps.
-        step: steps done.
+        step: number of steps so far.
 
     Returns:
-        The reason, with the field that it is about; None where it can go on, to the bit.
+        The reason, with the field that causes it; None if the lane can continue.
     """
     fraction, slots = before["final_learning_rate_fraction"], before["replay_capacity"]
     if fraction != 1.0:
@@ -220,9 +225,9 @@ def why_not_longer(before: Mapping[str, Any], after: Mapping[str, Any], step: in
 
 
 def named_numbers(leaf: ArrayLike) -> Any:
-    """A parameter of an environment, JSON-ready: its numbers, or a digest of very many.
+    """A parameter of an environment, JSON-ready: its numbers, or a digest if there are many.
 
-    A recording's numbers would fill a file's header, each time that a checkpoint is written.
+    The numbers of a recording would make the header of every checkpoint too large.
     """
     array = np.asarray(leaf)
     if array.size <= MOST_NUMBERS:
@@ -232,7 +237,7 @@ def named_numbers(leaf: ArrayLike) -> Any:
 
 
 def versions() -> dict[str, str]:
-    """Versions on which a lane's bits depend."""
+    """Versions of the packages that determine a lane's results bit by bit."""
     return versions_of(("rtd3jax", "jax", "jaxlib"))
 
 
@@ -242,13 +247,13 @@ def checkpoint_steps(directory: Path) -> list[int]:
 
 
 def to_arrays(state: LaneState) -> dict[str, np.ndarray]:
-    """The leaves under the names of their places; typed keys as their data."""
+    """The leaves by their paths in the state; typed keys as their data."""
     leaves = jax.tree_util.tree_leaves_with_path(state)
     return {jax.tree_util.keystr(path): _to_array(leaf) for path, leaf in leaves}
 
 
 def _extended(arrays: dict[str, np.ndarray], program: Program, lane: Lane) -> dict[str, np.ndarray]:
-    """Arrays of a lane that now has more steps: longer ones end as those of a new lane do."""
+    """Arrays of a lane that has more steps now, extended with the values of a new lane."""
 
     def longer(lane: Lane) -> dict[str, jax.Array]:
         leaves = jax.tree_util.tree_leaves_with_path(program.init(lane))
@@ -267,14 +272,14 @@ def _extended(arrays: dict[str, np.ndarray], program: Program, lane: Lane) -> di
 
 
 def _is_head(short: tuple[int, ...], long: tuple[int, ...]) -> bool:
-    """Whether an array of the first shape may be the beginning of one of the second."""
+    """Whether an array of shape ``short`` can be the beginning of an array of shape ``long``."""
     return len(short) == len(long) > 0 and short[0] < long[0] and short[1:] == long[1:]
 
 
 def from_arrays(
     arrays: dict[str, np.ndarray], program: Program, lane: Lane, file: Path
 ) -> LaneState:
-    """The state that `to_arrays` took apart, checked against what the program expects."""
+    """The state from the arrays of `to_arrays`, checked against the program's state."""
     expected = jax.eval_shape(program.init, lane)
     leaves, structure = jax.tree_util.tree_flatten_with_path(expected)
     names = [jax.tree_util.keystr(path) for path, _ in leaves]
@@ -288,10 +293,10 @@ def from_arrays(
 
 
 def leaves_from_arrays(expected: Any, arrays: dict[str, np.ndarray], place: str, file: Path) -> Any:
-    """A part of a state, of the structure of ``expected``, from where it stood in the whole.
+    """A part of a state with the structure of ``expected``, from the arrays under ``place``.
 
     Raises:
-        UserError: when the arrays at ``place`` are not such.
+        UserError: when the arrays under ``place`` do not have this structure.
     """
     leaves, structure = jax.tree_util.tree_flatten_with_path(expected)
     named = [(place + jax.tree_util.keystr(path), leaf) for path, leaf in leaves]
@@ -334,7 +339,7 @@ def checkpoint_files(directory: Path) -> list[Path]:
 
 
 def _unfinished(directory: Path) -> list[Path]:
-    """What a killed process left half-written."""
+    """Incomplete files of a process that was killed."""
     return list(directory.glob(".step-*.tmp"))
 
 

@@ -1,9 +1,10 @@
-"""Lanes over cores and devices: who runs which group of lanes, and for how many steps.
+"""Distributes groups of lanes over cores and devices, in chunks of steps.
 
-A *group* is what one call of a compiled program advances: on a CPU a single lane, so that a lane's
-numbers cannot depend on its company and no product is split over threads; on an accelerator as
-many lanes as there are, under ``vmap``, because there width is nearly free. Each device has a
-worker that takes the group that lags most, so that five lanes keep two cores equally busy.
+A *group* is a set of lanes that one call of a compiled program advances. On a CPU, a group is a
+single lane: the results of a lane then do not depend on other lanes, and no product is split over
+threads. On an accelerator, a group holds all lanes of a program under ``vmap``, because wider
+products cost little there. Each worker takes the group with the fewest steps, so that five lanes
+keep two cores equally busy.
 """
 
 import contextlib
@@ -28,21 +29,21 @@ from rtd3jax.training.loop import HEALTHY, Lane, LaneState, Program, revived
 from rtd3jax.training.start import Start
 
 CHUNK_SECONDS = 1.0
-"""Wall time at which a chunk aims: the pace of progress, and the wait after Ctrl-C."""
+"""Target wall time of a chunk: the interval of progress, and the delay after Ctrl-C."""
 
 _FIRST_CHUNK = 32
 
 
 @dataclasses.dataclass(eq=False)
 class Job:
-    """One lane to be trained: its program, what is its own, and what it is called.
+    """One lane to be trained.
 
     Attributes:
-        program: what is compiled.
-        lane: its seed, hyperparameters and environment parameters.
-        cell: what it is a lane of; jobs of one cell stand together in a list of jobs.
-        seed: which of the cell's lanes it is.
-        start: what was trained before and it goes on from; None for new weights.
+        program: the program to compile.
+        lane: the seed, the hyperparameters and the environment parameters of the lane.
+        cell: key of the cell of the lane; jobs of one cell are adjacent in a list of jobs.
+        seed: the seed of the lane within its cell.
+        start: trained networks from which training starts; None for new weights.
     """
 
     program: Program
@@ -53,23 +54,23 @@ class Job:
 
     @property
     def key(self) -> tuple[Any, int]:
-        """What tells it from all other jobs."""
+        """The unique key of the job."""
         return self.cell, self.seed
 
 
 @dataclasses.dataclass(eq=False)
 class Group:
-    """Jobs that advance together, and how far they are.
+    """Jobs that advance together, and their progress.
 
     Attributes:
-        jobs: of one program.
-        wave: groups of a wave are begun before those of the next.
-        state: of all lanes, with a leading axis where there are several; None before the start.
-        step: steps done.
-        returns: the curves so far on the host, [lanes, K]: ``state`` may be in use on a device.
-        metrics: likewise, of learning: [lanes, K, M].
+        jobs: jobs of one program.
+        wave: groups of a wave begin before groups of the next wave.
+        state: state of all lanes, with a leading axis if there are several; None before the start.
+        step: number of steps so far.
+        returns: learning curves so far, [lanes, K], on the host: a device may be using ``state``.
+        metrics: metrics of learning so far, [lanes, K, M], on the host.
         lost: whether every lane has failed.
-        error: what a failed group raised.
+        error: the exception of a group that failed.
     """
 
     jobs: list[Job]
@@ -83,16 +84,16 @@ class Group:
 
     @property
     def total(self) -> int:
-        """Steps to be done."""
+        """Number of steps of the whole training."""
         return self.jobs[0].program.config.total_steps
 
     @property
     def finished(self) -> bool:
-        """Whether nothing is left to do: done, failed, or every lane lost."""
+        """Whether the group has ended: all steps done, an error, or every lane lost."""
         return self.error is not None or self.step >= self.total or self.lost
 
     def lanes(self) -> Iterator[tuple[Job, LaneState]]:
-        """Each job with its lane's state."""
+        """Each job with the state of its lane."""
         assert self.state is not None
         if len(self.jobs) == 1:
             yield self.jobs[0], self.state
@@ -111,10 +112,10 @@ def default_strategy() -> str:
 def workers() -> list[Any]:
     """The device of each worker: one worker per accelerator, or one per CPU core.
 
-    On a CPU all workers share JAX's one device. Their programs are compiled without Eigen's
-    threads, so that the cores are shared out by lanes and not within a product (XLA's runtime may
-    still move whole kernels between its threads); a second device would only compile everything a
-    second time. Where XLA was told to show several CPU devices, each of them has a worker.
+    On a CPU, all workers share JAX's single device. Their programs are compiled without Eigen's
+    threads, so each core works on another lane, and no product is split (XLA's runtime may still
+    move whole kernels between its threads). A second device would compile every program a second
+    time. If XLA was configured to show several CPU devices, there is a worker for each.
     """
     first = _default_device()
     if first.platform == "cpu" and len(jax.local_devices(backend="cpu")) == 1:
@@ -123,7 +124,7 @@ def workers() -> list[Any]:
 
 
 def _default_device() -> Any:
-    """The device that JAX uses where none is named; `jax_default_device` chooses another."""
+    """JAX's default device, which `jax_default_device` can set."""
     return jax.config.values["jax_default_device"] or jax.local_devices()[0]
 
 
@@ -136,11 +137,11 @@ def make_groups(
 ) -> list[Group]:
     """Groups of one lane (``map``), or one group per program and device (``vmap``).
 
-    With ``checkpoints``, only lanes that go on from the same step are grouped, so that one that is
-    new does not make the others start over.
+    With ``checkpoints``, only lanes whose checkpoints are at the same step form a group, so a new
+    lane does not make the others start from the beginning.
 
-    With ``at_once``, no more lanes than that are under way together, each device under ``vmap``:
-    groups are split, and wait for those before them.
+    ``at_once`` limits the number of lanes in memory, under ``vmap`` for each device: groups are
+    split, and a group waits until earlier groups have ended.
     """
     most = at_once or len(jobs)
     if strategy == "map":
@@ -155,7 +156,7 @@ def make_groups(
         for start in range(min(devices, len(members)))
     ]
     chunks = [share[k : k + most] for share in shares for k in range(0, len(share), most)]
-    # What fits one by one need not fit together with what waits beside it.
+    # Lanes that fit in memory alone need not fit together with lanes that wait.
     return [Group(chunk, wave=index // devices) for index, chunk in enumerate(chunks)]
 
 
@@ -167,10 +168,10 @@ def advance_groups(
 ) -> None:
     """Advance every group to its end, calling ``on_chunk`` in this thread after each chunk.
 
-    A group that raises keeps its error and does not touch the others. An interrupt stops the
-    workers after their current chunks and is raised again. With ``checkpoints``, groups go on from
-    where theirs were, write them as they go, and once more when they are interrupted. ``devices``
-    has one for each worker, `workers` by default.
+    If a group raises an error, the group keeps it, and the other groups continue. After an
+    interrupt, the workers finish their current chunks, and the interrupt is raised again. With
+    ``checkpoints``, groups continue from their checkpoints, and write new ones at intervals and
+    after an interrupt. ``devices`` has a device for each worker, by default those of `workers`.
     """
     pool = _Pool(groups)
     threads = [
@@ -194,7 +195,7 @@ def advance_groups(
 
 
 class _Pool:
-    """The groups that workers share; every method is safe to call from any thread."""
+    """The groups that workers share; every method is thread-safe."""
 
     def __init__(self, groups: Sequence[Group]):
         self._idle = [group for group in groups if not group.finished]
@@ -208,14 +209,14 @@ class _Pool:
         self._changed = threading.Condition()
 
     def take(self) -> Group | None:
-        """The idle group with the least done; None when there will be none for this worker."""
+        """The idle group with the fewest steps; None if this worker will get no more groups."""
         with self._changed:
             while not self._idle and self._busy and not self._stopped:
                 self._changed.wait()
             if not self._idle or self._stopped:
                 return None
-            # Cell after cell, so that results come early and few replays are held at once;
-            # within a cell the group that lags most.
+            # One cell after the other, so that results come early and few replays are in memory;
+            # within a cell, the group with the fewest steps.
             group = min(self._idle, key=lambda g: (self._rank[id(g)], g.step))
             self._idle.remove(group)
             self._busy += 1
@@ -230,13 +231,13 @@ class _Pool:
             self._changed.notify_all()
 
     def events(self) -> Iterator[Group]:
-        """Groups as their chunks end, until all are finished."""
+        """Yield a group after each of its chunks, until all groups have ended."""
         while True:
             with self._changed:
                 while not self._events:
                     if not self._idle and not self._busy:
                         return
-                    # A timeout, so that an interrupt reaches the main thread.
+                    # With a timeout, so that an interrupt reaches the main thread.
                     self._changed.wait(timeout=0.2)
                 group = self._events.pop(0)
             yield group
@@ -248,14 +249,14 @@ class _Pool:
 
 
 def _work(pool: _Pool, device: jax.Device, checkpoints: Checkpoints | None) -> None:
-    """A device's worker."""
-    # jax_debug_nans would take our own NaN for a fault: points of curves that are not reached yet.
+    """The worker of a device."""
+    # jax_debug_nans must be off: points of curves that are not reached yet are NaN.
     with jax.debug_nans(False):
         _train(pool, device, checkpoints)
 
 
 def _train(pool: _Pool, device: jax.Device, checkpoints: Checkpoints | None) -> None:
-    """Chunks of the lagging group, as long as there is one."""
+    """Run chunks of the group with the fewest steps, as long as there is a group."""
     rates: dict[Any, float] = {}
     while (group := pool.take()) is not None:
         try:
@@ -265,7 +266,7 @@ def _train(pool: _Pool, device: jax.Device, checkpoints: Checkpoints | None) -> 
                 _chunk(group, device, rates)
             if checkpoints is not None and not group.finished and checkpoints.is_due(group):
                 checkpoints.save(group.lanes(), group, group.step)
-        except BaseException as error:  # contained: the others go on
+        except BaseException as error:  # the group keeps the error; the others continue
             group.error = error
         pool.give_back(group)
 
@@ -292,7 +293,7 @@ def _advanced(group: Group, state: LaneState, step: int) -> None:
 
 
 def stacked(lanes: Sequence[Lane], device: jax.Device) -> Lane:
-    """The lanes on a device: one as it is, several side by side."""
+    """The lanes on a device; several lanes get a leading axis."""
     one = len(lanes) == 1
     lane = lanes[0] if one else jax.tree.map(lambda *leaves: jnp.stack(leaves), *lanes)
     return jax.device_put(lane, device)
@@ -306,13 +307,13 @@ def _chunk(group: Group, device: jax.Device, rates: dict[Any, float]) -> None:
     state = jax.device_put(state, device)
     rate = rates.get((program, width))
     steps = _FIRST_CHUNK if rate is None else max(1, int(rate * CHUNK_SECONDS))
-    # Before learning starts steps are cheap: a chunk that crosses over would be far too long.
+    # Steps before learning starts are fast: a chunk across this step would take far too long.
     warm_up = program.config.learning_starts
     stop = min(group.step + steps, group.total)
     if group.step < warm_up:
         stop = min(warm_up, group.total)
     environments = program.config.environments
-    stop = -(-stop // environments) * environments  # they step together
+    stop = -(-stop // environments) * environments  # all environments step together
     began = time.perf_counter()
     state = advance(lane, state, jnp.int32(group.step), jnp.int32(stop))
     jax.block_until_ready(state)
@@ -323,7 +324,7 @@ def _chunk(group: Group, device: jax.Device, rates: dict[Any, float]) -> None:
 
 
 def _begun(group: Group, state: LaneState) -> LaneState:
-    """The group's new ``state``, of which each lane may go on from what was trained before."""
+    """The group's new ``state``, in which each lane gets the networks from which it starts."""
     if all(job.start is None for job in group.jobs):
         return state
     fresh = dataclasses.replace(group, state=state)
@@ -335,11 +336,11 @@ def _begun(group: Group, state: LaneState) -> LaneState:
 
 
 _COPIES = 3
-"""Programs that differ in nothing but the environment's object, from which on a warning says so."""
+"""Number of programs that differ only in the environment object, at which a warning is given."""
 
 
 def _warn_of_copies(program: Program) -> None:
-    """Warn, once, where a new environment object is made for each training."""
+    """Warn once if each training uses a new environment object."""
     kind = type(program.env)
 
     def rest(program: Program) -> tuple[object, ...]:
@@ -352,15 +353,15 @@ def _warn_of_copies(program: Program) -> None:
     }
     if kind.__eq__ is object.__eq__ and len(copies) + 1 == _COPIES:
         warnings.warn(
-            f"{_COPIES} programs of {kind.__name__} differ only in the environment's object, and "
-            "each costs its compilation and some 100 MiB: use one object, or inherit "
-            "rtd.ValueIdentity, which says when two are equal",
+            f"{_COPIES} programs of {kind.__name__} differ only in the environment object; each "
+            "needs its own compilation and about 100 MiB: use one object, or inherit from "
+            "rtd.ValueIdentity, which defines when two objects are equal",
             stacklevel=2,
         )
 
 
 class _Compiled:
-    """The executables of one program, compiled by whoever needs them first."""
+    """The executables of one program; the first worker that needs them compiles them."""
 
     def __init__(self) -> None:
         self.lock = threading.Lock()
@@ -373,7 +374,7 @@ _programs_lock = threading.Lock()
 
 @on_full
 def _let_go() -> None:
-    """Workers that are inside a program keep it; the others compile, or read it from the cache."""
+    """Remove all programs. A worker keeps the program that it is running; others compile again."""
     with _programs_lock:
         _programs.clear()
 
@@ -405,7 +406,7 @@ def _compile(program: Program, lane: Lane, batched: bool, device: jax.Device) ->
     go_on = jax.jit(advance, donate_argnums=1, compiler_options=options)
     with ThreadPoolExecutor(1) as helper, _no_collection():
         state, step = begin.eval_shape(lane), jax.ShapeDtypeStruct((), jnp.int32)
-        # The small program is compiled, or read from the cache, while the large one is traced.
+        # The small program is compiled, or read from the cache, during the trace of the large one.
         first = helper.submit(begin.lower(lane).compile)
         second = go_on.lower(lane, state, step, step).compile()
         return first.result(), second
@@ -413,7 +414,7 @@ def _compile(program: Program, lane: Lane, batched: bool, device: jax.Device) ->
 
 @contextlib.contextmanager
 def _no_collection() -> Iterator[None]:
-    """Tracing makes many small objects and no garbage; collecting meanwhile takes a tenth of it."""
+    """Switch off garbage collection during a trace, of which it would take a tenth of the time."""
     enabled = gc.isenabled()
     gc.disable()
     try:

@@ -1,7 +1,7 @@
-"""One lane: act, learn, step, store, and evaluate at intervals. All of it is one jitted loop.
+"""The loop of one lane, as one jitted program: act, update, step, store, and evaluate.
 
-What is learned, and what must be kept for it, are the agent's and the replay's to know. A
-transition can be sampled from the step after it, when the agent has acted upon its successor.
+The agent and the replay define the updates and the stored data. A transition can be sampled from
+the next step on, because then the agent has acted on the next observation.
 """
 
 import dataclasses
@@ -46,17 +46,17 @@ from rtd3jax.training.metrics import (
 
 HEALTHY, ENVIRONMENT_NOT_FINITE, LOSS_NOT_FINITE = 0, 1, 2
 
-# Streams of a lane's random numbers; each is folded into the lane's key once.
+# Streams of a lane's random numbers; each number is folded into the lane's key once.
 _INIT, _RESET, _STEPS, _EVALUATION, _REVIVED = range(5)
 
 
 @struct.dataclass
 class Lane:
-    """What tells lanes of one program apart.
+    """The data in which lanes of one program differ.
 
     Attributes:
         seed: uint32 [].
-        hyperparameters: numbers of the configuration.
+        hyperparameters: traced numbers of the configuration.
         env_params: the environment's parameters.
     """
 
@@ -67,23 +67,22 @@ class Lane:
 
 @struct.dataclass
 class LaneState:
-    """Everything that a lane is between two steps. ``K`` evaluations, ``E`` environments.
+    """The state of a lane between two steps. ``K`` evaluations, ``E`` environments.
 
     Attributes:
-        learner: networks and optimisers, as the agent's learner keeps them.
-        replay: what was seen.
-        statistics: of the observations seen, where networks read them normalised; else None.
-        env_state: the environments' own; of several with a leading axis.
-        observation: [E, O], those to act upon.
-        previous_action: [E, A], in half ranges as all actions of an agent; zero at an episode's
-            start.
-        episode_step: int32 [E], steps done in the episode.
-        carry: the actor's, leaves [E, ...], where it runs on from the episode's start; else None.
+        learner: the learner's state: networks and optimisers.
+        replay: the replay of transitions.
+        statistics: statistics of the observations, if networks read them normalised; else None.
+        env_state: the state of the environment; with a leading axis for several environments.
+        observation: [E, O], the current observations.
+        previous_action: [E, A], in half ranges; zero at the start of an episode.
+        episode_step: int32 [E], number of steps of the episode so far.
+        carry: the actor's running carry, leaves [E, ...]; None without one.
         returns: [K], mean return of each evaluation so far.
-        true_returns: [K], the same of the undisturbed state's reward.
-        metrics: of learning, averaged over each interval between evaluations.
-        failure: int32 [], HEALTHY, or what was first seen not to be finite.
-        failed_at: int32 [], the step of that.
+        true_returns: [K], mean return of the undisturbed state's reward.
+        metrics: metrics of learning, averaged over each interval between evaluations.
+        failure: int32 [], HEALTHY, or the first quantity that was not finite.
+        failed_at: int32 [], the step of the failure.
     """
 
     learner: Any
@@ -103,11 +102,11 @@ class LaneState:
 
 @dataclasses.dataclass(frozen=True)
 class Program:
-    """What is static: lanes with equal programs share one compilation.
+    """The static part of a lane: lanes with equal programs share one compiled program.
 
     Attributes:
         env: the environment, compared by its `__eq__`.
-        config: with traced fields at their defaults; see `make_program`.
+        config: the configuration with traced fields at their defaults; see `make_program`.
         observation_size: O.
         action_shape: shape of the environment's action.
     """
@@ -164,10 +163,10 @@ class Program:
         )
 
     def advance(self, lane: Lane, state: LaneState, start: jax.Array, stop: jax.Array) -> LaneState:
-        """The lane after steps ``start`` to ``stop - 1`` (int32 []), however they are cut.
+        """The lane after steps ``start`` to ``stop - 1`` (int32 []).
 
-        Steps are those of environments, of which several are done at once where there are several:
-        ``start`` and ``stop`` are multiples of their number.
+        The division of steps into calls has no effect on the result. Steps are counted over all
+        environments, so ``start`` and ``stop`` are multiples of the number of environments.
         """
         count = self.config.environments
         return lax.fori_loop(
@@ -175,7 +174,7 @@ class Program:
         )
 
     def policy(self, lane: Lane, state: LaneState) -> Policy:
-        """The deterministic policy that the lane has learned."""
+        """The deterministic policy of the lane's actor."""
         return Policy(
             actor=state.learner.actor,
             normaliser=_normaliser(state.statistics),
@@ -250,7 +249,7 @@ class Program:
                 hyperparameters.history_length,
                 carry,
             ),
-            # Losses are not negative, and actions not above one.
+            # Always false: a loss is never negative, and an action never exceeds one.
             never=(loss < 0.0) & jnp.all(action > 1.0),
         )
         finite = jnp.all(jnp.isfinite(final_observation)) & jnp.all(jnp.isfinite(reward))
@@ -274,7 +273,7 @@ class Program:
         return self._evaluate(lane, state, (step + 1) * self.config.environments)
 
     def _reset(self, key: jax.Array, lane: Lane) -> tuple[jax.Array, Any]:
-        """The environments' first observations [E, O], and their state."""
+        """The first observations [E, O] of the environments, and their state."""
         with foreign_code():
             if self.config.environments == 1:
                 observation, env_state = self.env.reset(key, lane.env_params)
@@ -289,7 +288,8 @@ class Program:
 
         Returns:
             The next observations [E, O], the state, rewards, terminations and truncations [E], and
-            the observations that the actions led to [E, O], where an episode ended its final one.
+            the observations [E, O] before automatic resets, which are final ones at the end of an
+            episode.
         """
         bounds = self.bounds(lane)
 
@@ -308,13 +308,13 @@ class Program:
     def _explore(
         self, greedy: jax.Array, key: jax.Array, hyperparameters: Hyperparameters, step: jax.Array
     ) -> jax.Array:
-        """Uniform before learning starts, then the agent's actions [E, A] with noise: [E, A].
+        """The actions [E, A]: uniform before learning starts, then those of the agent with noise.
 
-        A lane that goes on from a trained policy acts by it from its first step.
+        A lane that starts from trained networks uses its policy from the first step on.
         """
         uniform_key, noise_key = jax.random.split(key)
         noisy = add_noise(noise_key, greedy, hyperparameters.exploration_noise)
-        if self.config.start:  # it can act already
+        if self.config.start:  # the actor is already trained
             return noisy
         uniform = jax.random.uniform(uniform_key, noisy.shape, jnp.float32, -1.0, 1.0)
         starts = self.config.learning_starts
@@ -330,7 +330,7 @@ class Program:
         hyperparameters: Hyperparameters,
         step: jax.Array,
     ) -> tuple[Any, Averages, jax.Array]:
-        """The step's updates, if it has some; their critics' loss [], 0 without one."""
+        """The updates of the step, if any, and the critics' loss [], 0 without updates."""
         config = self.config
         count = step * config.environments
         hyperparameters = hyperparameters.decayed(count.astype(jnp.float32) / config.total_steps)
@@ -362,11 +362,11 @@ class Program:
         def wait(learner: Any, metrics: Averages) -> tuple[Any, Averages, jax.Array]:
             return learner, metrics, jnp.float32(0.0)
 
-        # The step is common to all lanes, so that this stays a branch under vmap.
+        # The step is the same in all lanes, so that this stays a branch under vmap.
         return lax.cond(due, learn, wait, learner, metrics)
 
     def _evaluate(self, lane: Lane, state: LaneState, done_steps: jax.Array) -> LaneState:
-        """The periodic evaluation, on a stream of its own; also at the very end."""
+        """The evaluation at intervals and at the end, with its own random stream."""
         config = self.config
 
         def evaluate(curves):
@@ -396,7 +396,7 @@ class Program:
 
 
 def revived(program: Program, lane: Lane, state: LaneState, step: int) -> LaneState:
-    """A lane from a checkpoint; a simulator that cannot be brought back begins a fresh episode."""
+    """Restore the simulators of a lane from a checkpoint; if impossible, begin new episodes."""
     env: Any = innermost(program.env)
     simulator = simulator_state(state.env_state)
     if simulator is None or int(state.failure) != HEALTHY:
@@ -428,11 +428,11 @@ def make_program(
     action_shape: tuple[int, ...],
     window: int | None = None,
 ) -> Program:
-    """The program of lanes that differ in nothing but traced numbers.
+    """The program of lanes that only differ in traced numbers.
 
-    With ``window``, lanes may differ in their history length too, up to that: the window's arrays
-    are as long, and what is beyond a lane's own length does not exist for it. Segments, which begin
-    with a stored carry, have the burn-in of their own configuration.
+    With ``window``, lanes may also differ in their history length, up to ``window``: the arrays of
+    the window have this length, and tokens beyond the history length of a lane do not exist for it.
+    Segments, which begin with a stored carry, use the burn-in of their own configuration.
     """
     defaults = {name: getattr(Config, name) for name in traced_fields()}
     static = dataclasses.replace(config, **defaults, start=config.start and "trained")
@@ -442,7 +442,7 @@ def make_program(
 
 
 def make_lane(config: Config, seed: int, env_params: object) -> Lane:
-    """A lane of `make_program`'s program, with concrete arrays for leaves."""
+    """A lane of the program of `make_program`; its leaves are concrete arrays."""
     numbers = {name: jnp.float32(getattr(config, name)) for name in traced_fields()}
     numbers["history_length"] = jnp.int32(config.window_tokens)
     env_params = jax.tree.map(_array, env_params)

@@ -1,4 +1,4 @@
-"""What is measured while an agent learns, averaged between evaluations, inside the jitted loop.
+"""Metrics of learning, averaged between evaluations inside the jitted loop.
 
 Shapes: ``K`` evaluations, ``M`` metrics.
 """
@@ -12,19 +12,19 @@ from flax import struct
 from rtd3jax.agents.learners.base import Metrics
 
 EXPLORATION_RETURN = "exploration_return"
-"""Mean return of the training episodes that ended in an interval, with exploration."""
+"""Name of the mean return, with exploration, of training episodes that ended in an interval."""
 
 
 @struct.dataclass
 class Averages:
-    """Averages of past intervals, and sums of the present one.
+    """Averages of past intervals, and sums of the current interval.
 
     Attributes:
-        totals: float32 [M], of what was measured in this interval.
-        counts: float32 [M], how often.
-        episode_return: float32 [E], of each environment's episode under way.
-        curves: float32 [K, M], averages; NaN where nothing was measured.
-        names: of the metrics.
+        totals: float32 [M], sums of the measurements in this interval.
+        counts: float32 [M], numbers of measurements.
+        episode_return: float32 [E], the return so far of each environment's current episode.
+        curves: float32 [K, M], averages; NaN without measurements.
+        names: names of the metrics.
     """
 
     totals: jax.Array
@@ -35,12 +35,12 @@ class Averages:
 
 
 def metric_names(learner: tuple[str, ...]) -> tuple[str, ...]:
-    """All names, where the learner measures those of ``learner``."""
+    """The names of all metrics, including those that the learner measures, ``learner``."""
     return (*learner, EXPLORATION_RETURN)
 
 
 def empty_averages(learner: tuple[str, ...], evaluations: int, environments: int) -> Averages:
-    """Before the first step, for a learner that measures ``learner``."""
+    """Averages without measurements, for a learner that measures ``learner``."""
     names = metric_names(learner)
     zeros = jnp.zeros((len(names),), jnp.float32)
     curves = jnp.full((evaluations, len(names)), jnp.nan, jnp.float32)
@@ -49,7 +49,7 @@ def empty_averages(learner: tuple[str, ...], evaluations: int, environments: int
 
 
 def note_update(averages: Averages, found: Metrics) -> Averages:
-    """With the measurements of an update."""
+    """Add the measurements of an update."""
     missing = [name for name in averages.names[:-1] if name not in found]
     assert not missing, f"the learner's update does not measure {missing}"
     pairs = [found[name] for name in averages.names[:-1]]
@@ -62,7 +62,7 @@ def note_update(averages: Averages, found: Metrics) -> Averages:
 
 
 def note_reward(averages: Averages, reward: jax.Array, done: jax.Array) -> Averages:
-    """With a step's ``reward`` [E]; ``done`` bool [E], whether its episode ended with it."""
+    """Add the ``reward`` [E] of a step; ``done`` bool [E]: whether the step ended its episode."""
     total = averages.episode_return + reward
     last = jnp.arange(len(averages.names), dtype=jnp.int32) == len(averages.names) - 1
     ended, count = jnp.sum(jnp.where(done, total, 0.0)), jnp.sum(done).astype(jnp.float32)
@@ -75,7 +75,7 @@ def note_reward(averages: Averages, reward: jax.Array, done: jax.Array) -> Avera
 
 
 def averaged(averages: Averages, index: jax.Array) -> Averages:
-    """At the end of interval ``index`` (int32 []): its averages kept, its sums forgotten."""
+    """End interval ``index`` (int32 []): store its averages, and set the sums to zero."""
     means = jnp.where(averages.counts > 0, averages.totals / averages.counts, jnp.nan)
     return dataclasses.replace(
         averages,

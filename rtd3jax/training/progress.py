@@ -1,4 +1,4 @@
-"""The bar that the host shows between chunks: steps, steps per second, time left, returns."""
+"""The progress bar: steps, steps per second, remaining time, and returns."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -11,13 +11,13 @@ from rich.progress import Progress as Bar
 from rtd3jax.training.lanes import Group, Job
 
 LONG_SECONDS = 60.0
-"""After which a training counts as long."""
+"""Seconds after which the remark is shown."""
 
 
 class Progress:
-    """A context in which `update` is called after every chunk.
+    """A context that shows the bar; call `update` after every chunk.
 
-    ``remark`` is shown once, above the bar, when the training has become a long one.
+    ``remark`` is shown once above the bar, if the training takes long.
     """
 
     def __init__(

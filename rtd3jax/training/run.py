@@ -1,4 +1,4 @@
-"""`train`: seeds of one configuration on one environment; the library's main call."""
+"""`train`: trains seeds of one configuration, or of several, on one environment."""
 
 import dataclasses
 import hashlib
@@ -45,17 +45,19 @@ from rtd3jax.training.progress import Progress
 from rtd3jax.training.start import Start, starts_of_path
 
 _REASONS = {
-    ENVIRONMENT_NOT_FINITE: "the environment gave an observation or reward that is not finite; "
+    ENVIRONMENT_NOT_FINITE: "the environment returned an observation or reward that is not finite; "
     "check its step function",
     LOSS_NOT_FINITE: "the critics' loss is not finite; lower actor_learning_rate and "
     "critic_learning_rate",
 }
-_NO_CHECKPOINTS = "no checkpoints are kept: if this process ends, all is lost (checkpoint_dir=...)"
+_NO_CHECKPOINTS = (
+    "no checkpoints are written: if this process ends, the training is lost (checkpoint_dir=...)"
+)
 
 
 @dataclasses.dataclass(frozen=True)
 class Failure:
-    """A lane that was lost: at which step, and why. ``step`` is -1 where it is not known."""
+    """A lane that was lost: the step and the reason. ``step`` is -1 if it is not known."""
 
     seed: int
     step: int
@@ -64,18 +66,18 @@ class Failure:
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """What `train` gives.
+    """The result of `train`.
 
     Attributes:
-        config: what was trained.
-        seeds: of the lanes, in the order asked for.
+        config: the configuration.
+        seeds: the seeds of the lanes, in the order of the argument.
         eval_steps: int64 [K], environment steps at each evaluation.
-        returns: float32 [seeds, K], mean return of an evaluation's episodes; NaN after a lane
+        returns: float32 [seeds, K], mean return of the episodes of an evaluation; NaN after a lane
             was lost.
-        true_returns: the same of the undisturbed state's reward.
+        true_returns: float32 [seeds, K], mean return of the undisturbed state's reward.
         failures: the lanes that were lost.
-        metrics: of learning, float32 [seeds, K] by name, averaged over the steps since the last
-            evaluation; NaN where nothing was measured. docs/run_a_study.md says what each is.
+        metrics: metrics of learning by name, float32 [seeds, K], averaged over the steps since the
+            last evaluation; NaN without measurements. docs/run_a_study.md explains each.
     """
 
     config: Config
@@ -101,7 +103,7 @@ class Run:
 
 
 StartLike = Policy | Run | str | Path | None
-"""What `train` may go on from; None for new weights."""
+"""Networks from which `train` can start; None for new weights."""
 
 
 @overload
@@ -146,32 +148,33 @@ def train(
     checkpoint_seconds: float | None = None,
     start: StartLike = None,
 ) -> Run | list[Run]:
-    """Train one lane per seed, of one configuration or of each of several.
+    """Train one lane per seed, for one configuration or for each of several.
 
     Args:
         env: a gymnax >= 1.0 environment with a bounded Box of actions.
-        config: of the agent; or several, of which those that differ in traced fields alone (such
-            as learning rates and the discount) share one compiled program.
-        seeds: distinct integers of at least 0; a seed's result does not depend on the others.
-        params: the environment's parameters; its own by default.
-        progress: whether to show a bar.
-        checkpoint_dir: where lanes keep checkpoints. The same call again goes on from them, to the
-            bit; seeds that were finished are not trained again, and go on where ``total_steps`` is
-            larger now. Of several configurations each has a directory there, ``config-0``,
-            ``config-1``, ... Without it, a process that is killed loses everything.
-        checkpoint_seconds: between two checkpoints of a lane; five minutes by default, or longer
-            where they would cost more than 2%.
-        start: what training goes on from: a `Policy`, a `Run` of the same seeds, the file of a
-            saved policy, or the ``checkpoint_dir`` of another training, which has critics and
-            optimisers too. See also ``freeze`` and ``actor_starts`` of `Config`.
-        strategy: ``map`` (lanes one by one, each on one core) or ``vmap`` (side by side); by
-            default what suits the backend.
+        config: the configuration of the agent, or several. Configurations that only differ in
+            traced fields (such as learning rates and the discount factor) share a compiled program.
+        seeds: distinct integers of at least 0; the result of a seed does not depend on the others.
+        params: the environment's parameters; its default parameters by default.
+        progress: whether to show a progress bar.
+        checkpoint_dir: directory for checkpoints. If you repeat the call, training continues from
+            them, with bit-identical results; seeds that have ended are not trained again, unless
+            ``total_steps`` is larger now. With several configurations, each has a subdirectory,
+            ``config-0``, ``config-1``, ... Without checkpoints, the training is lost if the process
+            is killed.
+        checkpoint_seconds: time between two checkpoints of a lane; by default five minutes, or
+            longer if checkpoints would take more than 2% of the time.
+        start: networks from which training starts: a `Policy`, a `Run` with the same seeds, the
+            file of a saved policy, or the ``checkpoint_dir`` of another training, which also holds
+            critics and optimisers. See also ``freeze`` and ``actor_starts`` of `Config`.
+        strategy: ``map`` (lanes one after the other, each on one core) or ``vmap`` (one batched
+            program); by default ``map`` on a CPU and ``vmap`` on an accelerator.
 
     Returns:
-        The run; of several configurations, a run for each, in their order.
+        The run; for several configurations, a list of runs in their order.
 
     Raises:
-        UserError: for an unfit environment or impossible arguments, before anything is compiled.
+        UserError: for an unsuitable environment or impossible arguments, before compilation.
     """
     single = isinstance(config, Config)
     configs = [config] if isinstance(config, Config) else list(config)
@@ -223,7 +226,7 @@ def _checkpoints(
     seconds: float | None,
 ) -> Checkpoints:
     environment = {"env": str(getattr(env, "name", type(env).__name__)), "params": None}
-    if is_simulated(env):  # what is seen of it, and with what it was made
+    if is_simulated(env):  # the observed elements, and the arguments of its construction
         environment["env"] = simulated_identity(env)
 
     def identity(job: Job) -> dict[str, Any]:
@@ -236,7 +239,7 @@ def _checkpoints(
 
 
 def _ended(groups: Iterable[Group]) -> dict[tuple[Any, int], tuple[Job, LaneState]]:
-    """The lanes of groups that have ended, by key; an error of a whole group is raised."""
+    """The lanes of groups that have ended, by key; raises the error of a group that failed."""
     found: dict[tuple[Any, int], tuple[Job, LaneState]] = {}
     for group in groups:
         if group.error is not None:
@@ -246,7 +249,7 @@ def _ended(groups: Iterable[Group]) -> dict[tuple[Any, int], tuple[Job, LaneStat
 
 
 def _horizon(params: Any) -> int | None:
-    """The most steps of an episode, where the environment's parameters say it as gymnax's do."""
+    """The time limit in the environment's parameters, as in gymnax's; None without it."""
     own = getattr(params, "env", params)
     steps = getattr(own, "max_steps_in_episode", None)
     return int(steps) if isinstance(steps, int) else None
@@ -262,9 +265,9 @@ def make_jobs(
     window: int | None = None,
     starts: Mapping[int, Start] | None = None,
 ) -> list[Job]:
-    """A job per seed, which is called ``(cell, seed)``; checks the environment.
+    """Check the environment, and make a job per seed with key ``(cell, seed)``.
 
-    With ``window``, jobs of shorter history lengths share the program of that length.
+    With ``window``, jobs of shorter history lengths share the program of length ``window``.
     """
     check_compiling()
     params = parameters_of(env, params)
@@ -280,14 +283,14 @@ def make_jobs(
 
 
 def check_starts(jobs: Iterable[Job], checkpoints: Checkpoints | None) -> None:
-    """Raise UserError where a lane that is new cannot begin from what it is to go on from."""
+    """Raise UserError if a new lane cannot start from the given networks."""
     for job in jobs:
         if job.start is not None and not (checkpoints and checkpoints.newest(job)):
             job.start.check(job.program, job.lane)
 
 
 def _starts(start: StartLike, seeds: tuple[int, ...]) -> dict[int, Start]:
-    """What each seed goes on from; empty for new weights."""
+    """The networks from which each seed starts; empty for new weights."""
     if start is None:
         return {}
     if isinstance(start, Policy):
@@ -299,15 +302,15 @@ def _starts(start: StartLike, seeds: tuple[int, ...]) -> dict[int, Start]:
     if isinstance(start, str | Path):
         return starts_of_path(start, seeds)
     raise UserError(
-        "start must be a policy, a run of rtd.train, the path of a saved policy or a directory of "
-        f"checkpoints, not {start!r}"
+        "start must be a policy, a run of rtd.train, the path of a saved policy, or a directory "
+        f"of checkpoints, not {start!r}"
     )
 
 
 def collect(
     config: Config, seeds: Sequence[int], lanes: Mapping[int, tuple[Job, LaneState]]
 ) -> Run:
-    """The run of these seeds, from their lanes that have ended."""
+    """The run of these seeds, from their ended lanes."""
     steps = evaluation_steps(config)
     failures, policies, returns, true_returns, metrics = [], [], [], [], []
     for seed in seeds:
@@ -332,7 +335,7 @@ def collect(
 
 
 def failure_of(seed: int, state: LaneState) -> Failure | None:
-    """What became of a lane, if it was lost."""
+    """The failure of a lane; None if it was not lost."""
     code = int(state.failure)
     if code == HEALTHY:
         return None
@@ -356,14 +359,14 @@ def check_seeds(seeds: Iterable[int]) -> tuple[int, ...]:
 
 
 def check_strategy(strategy: str | None) -> str:
-    """The strategy, or the backend's own."""
+    """The strategy; by default the one for the backend."""
     if strategy not in (None, "map", "vmap"):
         raise UserError(f"strategy must be 'map' or 'vmap', not {strategy!r}")
     return strategy or default_strategy()
 
 
 def evaluation_steps(config: Config) -> np.ndarray:
-    """Environment steps done at each evaluation: int64 [K]; the last is the end."""
+    """Number of environment steps at each evaluation: int64 [K]; the last is the end."""
     count = -(-config.total_steps // config.eval_every)
     return np.minimum(np.arange(1, count + 1) * config.eval_every, config.total_steps)
 
@@ -371,7 +374,7 @@ def evaluation_steps(config: Config) -> np.ndarray:
 def curves_of(
     config: Config, state: LaneState, failure: Failure | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A lane's returns and true returns [K]; nothing after its loss counts."""
+    """A lane's returns and true returns [K]; NaN after the lane was lost."""
     lost = evaluation_steps(config) > (np.inf if failure is None else failure.step)
     returns, true_returns = (
         np.where(lost, np.float32(np.nan), np.asarray(curve))
@@ -383,7 +386,7 @@ def curves_of(
 def metric_curves(
     config: Config, state: LaneState, failure: Failure | None
 ) -> dict[str, np.ndarray]:
-    """A lane's metrics of learning [K] by name; nothing after its loss counts."""
+    """A lane's metrics of learning [K] by name; NaN after the lane was lost."""
     lost = evaluation_steps(config) > (np.inf if failure is None else failure.step)
     curves = np.where(lost[:, None], np.float32(np.nan), np.asarray(state.metrics.curves))
     return dict(zip(state.metrics.names, curves.T, strict=True))

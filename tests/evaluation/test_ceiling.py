@@ -57,7 +57,7 @@ def test_the_sine_bound_is_named_as_one():
 
 
 def test_other_environments_are_refused_in_one_line():
-    with pytest.raises(rtd.UserError, match="no ceiling of MountainCarContinuous-v0 is known"):
+    with pytest.raises(rtd.UserError, match="the ceiling of MountainCarContinuous-v0 is not known"):
         rtd.ceiling(rtd.make("MountainCarContinuous-v0"))
     with pytest.raises(rtd.UserError, match="moments of SineSlip are not known"):
         rtd.bayes_policy(rtd.make("rover", disturbance="sine-slip"))

@@ -105,4 +105,4 @@ def test_equal_environments_share_a_program_and_copies_are_warned_of(monkeypatch
     for _ in range(4):
         compiled(Tank())
     (warning,) = [w for w in recwarn if w.category is UserWarning]
-    assert "3 programs of Tank differ only in the environment's object" in str(warning.message)
+    assert "3 programs of Tank differ only in the environment object" in str(warning.message)

@@ -20,13 +20,13 @@ def config(**changes):
     ("changes", "match"),
     [
         ({"total_steps": 20}, r"total_steps \(20\) is not more than learning_starts \(20\)"),
-        ({"total_steps": 900, "learning_starts": 1_000}, "no update is made"),
+        ({"total_steps": 900, "learning_starts": 1_000}, "there will be no update"),
         ({"total_steps": 21}, r"policy_delay \(2\) is more than the 1 critic updates"),
         ({"total_steps": 40, "update_every": 20}, "lower policy_delay or update_every"),
         ({"total_steps": 40, "policy_delay": 30}, "policy_delay .30. is more than the 20"),
         ({"actor_learning_rate": 0}, "actor_learning_rate is 0"),
         ({"critic_learning_rate": 0}, "critic_learning_rate is 0"),
-        ({"tau": 0}, "tau is 0, so that the targets"),
+        ({"tau": 0}, "tau is 0, so the target networks"),
         ({"reward_scale": 0}, "no reward will be learnt from"),
     ],
 )

@@ -71,5 +71,7 @@ def test_nan_from_an_environment_is_reported_as_its_own():
         eval_every=50,
     )
     run = rtd.train(Broken(), config, [0], progress=False)
-    assert "environment gave an observation or reward that is not finite" in run.failures[0].reason
+    assert (
+        "environment returned an observation or reward that is not finite" in run.failures[0].reason
+    )
     assert run.failures[0].step < 10 and np.isnan(run.returns).all()

@@ -34,7 +34,7 @@ def test_a_wrong_value_is_one_line(fields, line):
 def test_a_segment_is_not_longer_than_an_episode():
     env = rtd.make("rover", "ar1-slip", max_steps_in_episode=20)
     config = rtd.Config(replay="segments", segment_length=25)
-    with pytest.raises(rtd.UserError, match=r"longer than an episode ever gets \(20 steps\)"):
+    with pytest.raises(rtd.UserError, match=r"longer than any episode \(20 steps\)"):
         make_jobs(env, config, [0])
 
 

@@ -176,7 +176,7 @@ def test_a_lost_lane_is_no_start(env, kept, tmp_path):
 
 
 def test_an_actor_that_waits_to_the_end_is_named(env):
-    with pytest.warns(UserWarning, match="actor_starts .50. leaves the actor no update"):
+    with pytest.warns(UserWarning, match="actor_starts .50. allows no update of the actor"):
         make_jobs(env, _config(actor_starts=50, total_steps=50), [0])
 
 

@@ -177,7 +177,7 @@ def test_a_long_training_without_checkpoints_says_so_once(capsys, monkeypatch, t
         with progress.Progress([group], str, remark=run._NO_CHECKPOINTS) as bar:
             bar.update(group)
             bar.update(group)
-        assert capsys.readouterr().err.count("no checkpoints are kept") == times
+        assert capsys.readouterr().err.count("no checkpoints are written") == times
 
     remarks = []
 

@@ -201,7 +201,7 @@ def test_checkpoints_know_the_recording_without_holding_it(tmp_path):
     assert len(json.dumps(read_arrays(file)[1])) < 4_000
     again = rtd.train(rover(log), config, **arguments)
     np.testing.assert_array_equal(again.returns, first.returns)
-    with pytest.raises(UserError, match="is of another identity"):
+    with pytest.raises(UserError, match="belongs to another identity"):
         rtd.train(rover(log + 0.01), config, **arguments)
     first.policy(0).save(tmp_path / "policy.safetensors")
     loaded = rtd.load_policy(tmp_path / "policy.safetensors")
