@@ -50,13 +50,16 @@ def test_a_lane_of_a_run_directory_becomes_a_policy(run):
 @pytest.mark.parametrize(
     "which, message",
     [
-        ({}, "4 cells of .* fit; say which env: rover, pendulum"),
-        ({"env": "rover"}, "say which algorithm: h-td3, lstm-td3"),
-        ({"env": "rover", "algorithm": "h-td3"}, "say which history_length: 3, 5"),
-        ({"algorithm": "td3"}, "no such cell with algorithm=td3; there algorithm is h-td3 or"),
+        ({}, "4 cells of .* agree with the arguments; choose env: rover, pendulum"),
+        ({"env": "rover"}, "choose algorithm: h-td3, lstm-td3"),
+        ({"env": "rover", "algorithm": "h-td3"}, "choose history_length: 3, 5"),
+        (
+            {"algorithm": "td3"},
+            "no such cell with algorithm=td3; its values of algorithm are h-td3 and",
+        ),
         (
             {"env": "pendulum", "disturbance": "noise"},
-            "no such cell .* there disturbance is hidden",
+            "no such cell .* values of disturbance are hidden",
         ),
         ({"env": "pendulum", "seed": 9}, r"no seed 9; its seeds are \[0, 1, 2\]"),
         ({"env": "pendulum", "seed": 2}, "seed 2 is not trained yet"),
@@ -136,7 +139,7 @@ def test_the_command_reads_a_saved_policy(run, tmp_path, capsys):
     assert (tmp_path / "p.py").exists()
     capsys.readouterr()
     assert main([str(saved), "--format", "onnx", "--seed", "0"]) == 2
-    assert "p.safetensors is not a run directory, among whose lanes seed would choose" in (
+    assert "p.safetensors is not a run directory: seed cannot choose a lane" in (
         capsys.readouterr().err
     )
     assert main([str(tmp_path / "absent"), "--format", "onnx"]) == 2

@@ -1,1 +1,1 @@
-"""Processes from logs: estimates, how sure they are, and pictures of both."""
+"""Fits processes to logs: estimates, their standard errors, and plots."""

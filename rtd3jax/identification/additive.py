@@ -1,4 +1,4 @@
-"""Offsets: a wandering bias, and white noise."""
+"""Fits of processes that add an offset: a random bias, and white noise."""
 
 import math
 from collections.abc import Sequence
@@ -12,32 +12,33 @@ from rtd3jax.identification.result import Estimate, Fit
 
 
 def fit_ornstein_uhlenbeck(parts: Sequence[np.ndarray], max_slip: float | None = None) -> Fit:
-    """`OrnsteinUhlenbeck`: the regression of every value on the one before it.
+    """Fit `OrnsteinUhlenbeck` by the regression of each value on the previous value.
 
-    That maximises the likelihood given each first value, exactly. Errors come by the delta method
-    from those of the regression.
+    This regression maximises the likelihood, given the first value of each sequence. The delta
+    method gives the standard errors from those of the regression.
     """
     before, after = transitions(parts)
     count = before.size
     centre, spread = before.mean(), before.var()
     if spread == 0.0:
-        raise UserError("all values but the last are the same: there is nothing to fit")
+        raise UserError("all values except the last are equal: nothing can be fitted")
     decay = float(np.mean((before - centre) * (after - after.mean())) / spread)
     level = float(after.mean() - decay * centre)
     residual = after - level - decay * before
     variance = float(np.mean(residual**2))
     if not 0.0 < decay < 1.0:
-        reason = "wanders off without end" if decay >= 1.0 else "has no memory, or alternates"
+        reason = "is not stationary" if decay >= 1.0 else "has no memory, or alternates"
         raise UserError(
-            f"ornstein-uhlenbeck: the log's autocorrelation at one step is {decay:.3g}: it "
+            f"ornstein-uhlenbeck: the autocorrelation at one step is {decay:.3g}, so the log "
             f'{reason}; record longer, or fit "noise"'
         )
     if variance == 0.0:
-        raise UserError("ornstein-uhlenbeck: the log has no noise in it: nothing is random")
+        raise UserError("ornstein-uhlenbeck: the log has no random part")
     mean = level / (1.0 - decay)
     sigma = math.sqrt(variance / (1.0 - decay**2))
     constant = -1.0 / math.log(decay)
-    # Information of (mean, decay) about the mean, where it is diagonal; the variance is apart.
+    # Information matrix of (mean, decay), which is diagonal around the mean. The variance is
+    # independent of both.
     decay_error = math.sqrt(variance / (count * float(np.mean((before - mean) ** 2))))
     mean_error = math.sqrt(variance / count) / (1.0 - decay)
     variance_error = variance * math.sqrt(2.0 / count)
@@ -63,16 +64,16 @@ def fit_ornstein_uhlenbeck(parts: Sequence[np.ndarray], max_slip: float | None =
 
 
 def fit_noise(parts: Sequence[np.ndarray], max_slip: float | None = None) -> Fit:
-    """`GaussianNoise`: the root mean square, for the process has no mean."""
-    # As the others do, it counts the values that have one before them, so that AIC compares.
+    """Fit `GaussianNoise` by the root mean square, because the process has zero mean."""
+    # As in the other fits, only values with a previous value count, so that AIC is comparable.
     _, values = transitions(parts)
     variance = float(np.mean(values**2))
     mean, error = float(values.mean()), float(values.std()) / math.sqrt(values.size)
     notes = []
     if abs(mean) > 4.0 * error:
         notes.append(
-            f"The log's mean is {mean:.4g} and GaussianNoise has none: sigma covers it. "
-            'Subtract it, or fit "ornstein-uhlenbeck".'
+            f"The mean of the log is {mean:.4g}, but GaussianNoise has zero mean, so sigma "
+            'contains it. Subtract the mean, or fit "ornstein-uhlenbeck".'
         )
     sigma = math.sqrt(variance)
     return Fit(
@@ -89,12 +90,12 @@ def fit_noise(parts: Sequence[np.ndarray], max_slip: float | None = None) -> Fit
 
 
 def transitions(parts: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Every value that has one after it in its stretch, and that one: float64 [K] each."""
+    """All pairs of a value and the next value of its sequence: float64 [K] each."""
     before = np.concatenate([part[:-1].ravel() for part in parts])
     after = np.concatenate([part[1:].ravel() for part in parts])
     return before, after
 
 
 def gaussian(residual: np.ndarray, variance: float) -> float:
-    """The log-likelihood of residuals under their own variance."""
+    """The log-likelihood of normal residuals with the given variance."""
     return -0.5 * residual.size * (math.log(2.0 * math.pi * variance) + 1.0)

@@ -1,4 +1,4 @@
-"""The rover's clipped first-order slip."""
+"""Fits the rover's clipped first-order slip."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -14,13 +14,14 @@ from rtd3jax.identification.slip import TOLERANCE, bounded_slip
 
 
 def fit_ar1(parts: Sequence[np.ndarray], max_slip: float | None = None) -> Fit:
-    """`Ar1Slip` by the likelihood of a censored regression (Tobin, Econometrica 26, 1958).
+    """Fit `Ar1Slip` by the likelihood of a censored regression (Tobin, Econometrica 26, 1958).
 
-    A slip within the bounds has a density, and one at a bound the probability of all that lies
-    beyond. Errors come from the observed information at the maximum.
+    A slip within the bounds contributes its density; a slip at a bound contributes the probability
+    of all values beyond the bound. The standard errors follow from the observed information at the
+    maximum.
     """
 
-    from scipy.optimize import minimize  # a tenth of a second, which an import can do without
+    from scipy.optimize import minimize  # here, because its import takes a tenth of a second
 
     slip, bound, clipped = bounded_slip("ar1", parts, max_slip)
     before, after = transitions(slip)
@@ -28,7 +29,7 @@ def fit_ar1(parts: Sequence[np.ndarray], max_slip: float | None = None) -> Fit:
     top = (after >= bound - TOLERANCE) & clipped
     inside = ~(bottom | top)
     if inside.sum() < 3 or not np.any(before[inside] > TOLERANCE):
-        raise UserError("ar1: nearly all slip in the log is at a bound; record where wheels slip")
+        raise UserError("ar1: nearly all slip in the log is at a bound; record a better log")
     x, y = before[inside], after[inside]
     products = float(x @ x), float(x @ y), float(y @ y)
     low, high = before[bottom], before[top]
@@ -48,19 +49,19 @@ def fit_ar1(parts: Sequence[np.ndarray], max_slip: float | None = None) -> Fit:
     found = minimize(loss, start, method="L-BFGS-B", bounds=ranges, options={"ftol": 1e-12})
     rho, log_sigma = (float(number) for number in found.x)
     sigma = math.exp(log_sigma)
-    # Steps of about a tenth of a standard error: the loss is curved there, and not yet rounded.
+    # Steps of about a tenth of a standard error: the change of the loss exceeds its rounding.
     steps = np.array([0.1 * sigma / math.sqrt(products[0]), 0.1 / math.sqrt(2.0 * x.size)])
     covariance = np.linalg.inv(_curvature(loss, found.x, steps))
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     notes = []
     if rho in (0.0, 1.0):
         errors[0] = math.nan
-        notes.append(f"rho is at its bound {rho:g}, where it has no standard error.")
+        notes.append(f"rho is at its bound {rho:g}, so it has no standard error.")
     share = float(np.mean(~inside))
     if share > 0.0:
         notes.append(
-            f"{100 * share:.1f}% of the slip was clipped and counts as a probability: compare AIC "
-            "among fits of ar1 alone, and kinds by their error."
+            f"{100 * share:.1f}% of the slip was clipped and contributes a probability: compare "
+            "AIC only among fits of ar1, and compare kinds by their error."
         )
     expected = _clipped_mean(rho * before, sigma, bound)
     return Fit(

@@ -1,4 +1,4 @@
-"""`fit_process`: the parameters of one of our processes from a log."""
+"""`fit_process`: estimates the parameters of a process from a log."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -33,32 +33,33 @@ def fit_process(
     step: float | None = None,
     max_slip: float | None = None,
 ) -> Fit:
-    """Fit a process to a log, all of its episodes and elements together.
+    """Fit a process to all episodes and elements of a log together.
 
     | kind | process | what the log holds | method |
     |---|---|---|---|
-    | "ar1" | `Ar1Slip` | slip, 0 to 1 | maximum likelihood given each first value; what was \
-clipped counts as a probability |
+    | "ar1" | `Ar1Slip` | slip, 0 to 1 | maximum likelihood given each first value; a clipped \
+value contributes a probability |
     | "sine" | `SineSlip` | slip, 0 to 1 | least squares of each wave, the period by its profile |
     | "ornstein-uhlenbeck" | `OrnsteinUhlenbeck` | an offset | maximum likelihood given each first \
 value |
     | "noise" | `GaussianNoise` | an offset | maximum likelihood; the process has no mean |
 
     Args:
-        log: as `rtd3jax.Recorded` takes it, or one of these, such as the first part of a split.
-        kind: one of the above.
-        columns: as for `rtd3jax.Recorded`, with the next three.
+        log: a log as for `rtd3jax.Recorded`, or a `rtd3jax.Recorded`, such as the first part of a
+            split.
+        kind: one of the kinds above.
+        columns: as for `rtd3jax.Recorded`.
         episode: the column that numbers the episodes.
         period: time in s between two samples of the log.
         step: time in s between two steps of the environment.
-        max_slip: where slip is clipped, of "ar1" and "sine"; by default the largest in the log.
+        max_slip: upper bound of the slip, for "ar1" and "sine"; by default the largest in the log.
 
     Returns:
         The fitted process, ready for `rtd3jax.disturb` or the rover's ``slip``; estimates with
         standard errors; the likelihood; ``summary()`` and ``plot(path)``.
 
     Raises:
-        UserError: for a log that cannot be read, or that such a process cannot have made.
+        UserError: for a log that cannot be read, or to which the process cannot be fitted.
     """
     if kind not in KINDS:
         raise UserError(
@@ -68,7 +69,7 @@ value |
         given = {"columns": columns, "episode": episode, "period": period, "step": step}
         for name, value in given.items():
             if value is not None:
-                raise UserError(f"{name}= is for the log that was read, not for a Recorded")
+                raise UserError(f"{name}= is for a log, not for a Recorded, which was read before")
         low, high = np.asarray(log.low), np.asarray(log.high)
         parts = [np.clip(part, low, high).astype(np.float64) for part in log.sequences()]
     else:
@@ -85,8 +86,8 @@ value |
     values = sum(part.size for part in parts)
     if values < 10:
         raise UserError(
-            f"{values} values in stretches of two rows and more are too few to fit; record longer"
+            f"{values} values in sequences of two or more rows are too few to fit; record longer"
         )
     if np.ptp(np.concatenate([part.ravel() for part in parts])) == 0.0:
-        raise UserError("all values of the log are the same: there is nothing to fit")
+        raise UserError("all values of the log are equal: nothing can be fitted")
     return _FITS[kind](parts, max_slip)

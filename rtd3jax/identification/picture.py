@@ -1,4 +1,4 @@
-"""The picture of a fit: recorded against fitted."""
+"""Plots of a fit: recorded and simulated sequences."""
 
 import io
 import os
@@ -17,11 +17,11 @@ from rtd3jax.system.files import check_target, write_new
 RECORDED, FITTED = "#222222", "#D55E00"
 MOST_EPISODES = 200
 MOST_ROWS = 1_000
-"""Of an episode of the fitted process, and of a stretch whose spectrum is drawn."""
+"""Steps of an episode of the fitted process, and of a sequence for the spectrum, at most."""
 
 
 def played(process: Process, steps: int, size: int, episodes: int, seed: int) -> np.ndarray:
-    """What a process of an offset adds, or a process of slip takes: [episodes, steps, size]."""
+    """Simulated offsets or slips of a process: [episodes, steps, size]."""
     ones = jnp.ones((size,), jnp.float32)
     still = jnp.zeros((size,), jnp.float32)
 
@@ -29,7 +29,7 @@ def played(process: Process, steps: int, size: int, episodes: int, seed: int) ->
         first, rest = jax.random.split(key)
 
         def step(state: Any, key: jax.Array) -> tuple[Any, jax.Array]:
-            # A process of slip leaves zero as it is, and takes its slip from one.
+            # For the input 0, the output of a slip process is 0; for the input 1, it is 1 - slip.
             none, _ = process.step(key, state, still)
             one, state = process.step(key, state, ones)
             return state, jnp.where(none == 0.0, 1.0 - one, none)
@@ -49,7 +49,7 @@ def draw_fit(
     overwrite: bool,
     seed: int,
 ) -> None:
-    """Write the picture of a process beside the sequences [T, N]; see `Fit.plot`."""
+    """Write the plot of a process and the sequences [T, N]; see `Fit.plot`."""
     target = check_target(path, overwrite)
     from matplotlib import rc_context
     from matplotlib.figure import Figure
@@ -77,7 +77,7 @@ def draw_fit(
             figure.savefig(buffer, format=target.suffix.lstrip(".").lower() or "png")
         except ValueError as error:
             raise UserError(
-                f"{path}: {first_line(error)}; end its name in .png, .svg or .pdf"
+                f"{path}: {first_line(error)}; use a name that ends in .png, .svg or .pdf"
             ) from error
     write_new(path, buffer.getvalue(), overwrite)
 
@@ -99,7 +99,7 @@ def _draw_autocorrelation(axis: Any, recorded: Sequence[np.ndarray], fitted: Seq
 
 
 def autocorrelation(waves: Sequence[np.ndarray], lags: int) -> np.ndarray:
-    """Pooled over the waves about their common mean, [lags]; NaN at lags that none has."""
+    """The pooled autocorrelation around the common mean, [lags]; NaN at lags without data."""
     mean = np.concatenate(waves).mean()
     products, counts = np.zeros(lags), np.zeros(lags)
     for wave in waves:
@@ -123,7 +123,7 @@ def _draw_spectrum(axis: Any, recorded: Sequence[np.ndarray], fitted: Sequence[n
 
 
 def spectrum(waves: Sequence[np.ndarray], rows: int) -> np.ndarray | None:
-    """The averaged one-sided periodogram of all stretches of ``rows``, Hann's window over each."""
+    """The mean one-sided periodogram of all parts of ``rows`` rows, with a Hann window."""
     mean = np.concatenate(waves).mean()
     pieces = [
         wave[start : start + rows] - mean

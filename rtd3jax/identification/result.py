@@ -1,4 +1,4 @@
-"""What a fit found."""
+"""The result of a fit."""
 
 import dataclasses
 import math
@@ -13,7 +13,7 @@ from rtd3jax.envs.processes.process import Process
 class Estimate(NamedTuple):
     """A parameter's value and its standard error.
 
-    The error is NaN where there is none: at the end of a range, or of a bound.
+    The error is NaN for an end of a range, and for a value at a bound.
     """
 
     value: float
@@ -22,19 +22,19 @@ class Estimate(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Fit:
-    """A process that was fitted to a log.
+    """The result of fitting a process to a log.
 
     Attributes:
         kind: "ar1", "sine", "ornstein-uhlenbeck" or "noise".
-        process: with the estimated parameters.
-        estimates: by name; those that are fields of the process have its names.
-        log_likelihood: of the values given those that came before them.
-        parameters: how many were estimated.
-        error: root mean square of what the process leaves unexplained, in the log's unit: the error
-            of predicting a value from the one before it; under "sine", that of the fitted waves.
-        method: in a few words.
-        notes: what the user should know of this fit, in sentences.
-        sequences: the log, float64 [T, N] for each stretch.
+        process: the process with the estimated parameters.
+        estimates: estimates by name; a field of the process has the same name.
+        log_likelihood: log-likelihood of the values, given their previous values.
+        parameters: number of estimated parameters.
+        error: root mean square residual, in the log's unit: the error of predicting a value from
+            the previous value; for "sine", the error of the fitted waves.
+        method: the method of estimation, in a few words.
+        notes: remarks on this fit, in sentences.
+        sequences: the log, float64 [T, N] for each sequence.
     """
 
     kind: str
@@ -49,7 +49,7 @@ class Fit:
 
     @property
     def aic(self) -> float:
-        """Akaike's criterion, less is better: of fits to the same log without clipped values."""
+        """Akaike's criterion; compare it among fits to the same log, if no value is clipped."""
         return 2.0 * self.parameters - 2.0 * self.log_likelihood
 
     def summary(self) -> str:
@@ -70,12 +70,12 @@ class Fit:
         return "\n".join([*lines, *self.notes])
 
     def plot(self, path: str | os.PathLike, overwrite: bool = False, seed: int = 0) -> None:
-        """Draw recorded against fitted: distribution, autocorrelation, spectrum.
+        """Plot distribution, autocorrelation and spectrum of recorded and simulated sequences.
 
         Args:
-            path: of the picture; its ending says the format (.png, .svg, .pdf).
-            overwrite: replace a file that is there.
-            seed: of the fitted process's episodes.
+            path: path of the picture; the suffix chooses the format (.png, .svg, .pdf).
+            overwrite: whether to replace an existing file.
+            seed: seed of the simulated episodes.
 
         Raises:
             UserError: when the file exists and ``overwrite`` is false, or cannot be written.

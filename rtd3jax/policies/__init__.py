@@ -1,5 +1,5 @@
-"""Policies outside the trainer: the trained one, and the references that need no training.
+"""Policies for use outside the trainer: trained policies, and baselines without training.
 
-All share one interface: ``state = policy.init()``, then at each step
+All have the same interface: ``state = policy.init()``, then at each step
 ``action, state = policy.step(state, observation)``.
 """

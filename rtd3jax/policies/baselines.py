@@ -1,4 +1,4 @@
-"""Policies that need no training: the references of every table."""
+"""Policies that need no training, with which every table compares."""
 
 import jax
 import jax.numpy as jnp
@@ -14,12 +14,12 @@ from rtd3jax.protocols import EnvironmentLike
 
 @struct.dataclass
 class ConstantPolicy:
-    """Always the same action [A]."""
+    """A policy that always returns the same action [A]."""
 
     action: jax.Array
 
     def init(self, key: jax.Array | None = None) -> tuple:
-        """No state."""
+        """The policy has no state."""
         return ()
 
     def step(self, state: tuple, observation: jax.Array) -> tuple[jax.Array, tuple]:
@@ -29,17 +29,17 @@ class ConstantPolicy:
 
 @struct.dataclass
 class RandomPolicy:
-    """Uniform within the action's bounds."""
+    """A policy with uniform random actions within the bounds."""
 
     bounds: Bounds
     action_shape: tuple[int, ...] = struct.field(pytree_node=False)
 
     def init(self, key: jax.Array | None = None) -> jax.Array:
-        """The stream of random numbers; ``key`` starts it (default: a fixed one)."""
+        """The key of the random stream: ``key``, or a fixed key."""
         return jax.random.key(0) if key is None else key
 
     def step(self, state: jax.Array, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """A uniform action, and the next state of the stream."""
+        """A uniform random action, and the next key."""
         key, state = jax.random.split(state)
         low, high = self.bounds.low, self.bounds.high
         action = jax.random.uniform(key, low.shape, jnp.float32, low, high)
@@ -47,7 +47,7 @@ class RandomPolicy:
 
 
 def constant_policy(action: ArrayLike) -> ConstantPolicy:
-    """The policy that always does ``action``: a number or [A] in the environment's units."""
+    """The policy with the constant ``action``: a number or [A] in the environment's units."""
     array = jnp.atleast_1d(jnp.asarray(action, jnp.float32))
     if not bool(jnp.all(jnp.isfinite(array))):
         raise UserError(f"a constant policy needs finite actions, not {action!r}")
@@ -55,7 +55,7 @@ def constant_policy(action: ArrayLike) -> ConstantPolicy:
 
 
 def random_policy(env: EnvironmentLike, params: object = None) -> RandomPolicy:
-    """The uniform-random policy of ``env``: the floor of every table."""
+    """The uniform random policy of ``env``, the lowest reference of every table."""
     interface = describe(env, parameters_of(env, params))
     bounds = Bounds(jnp.asarray(interface.action_low), jnp.asarray(interface.action_high))
     return RandomPolicy(bounds, interface.action_shape)

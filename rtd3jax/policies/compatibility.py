@@ -1,4 +1,4 @@
-"""Whether a policy and an environment fit each other: asked wherever the two meet."""
+"""Checks that a policy fits an environment."""
 
 import warnings
 
@@ -17,21 +17,21 @@ def check_compatible(
     low: np.ndarray,
     high: np.ndarray,
 ) -> None:
-    """Compare what a policy was made for with an environment; warns of other bounds.
+    """Check that a policy fits the sizes of an environment; warn if action bounds differ.
 
     Args:
         policy: anything with ``init`` and ``step``.
         observation_size: elements of the environment's observation.
-        action_shape: of its action.
-        low: its lowest action, of any shape with as many elements.
-        high: its highest.
+        action_shape: shape of the environment's action.
+        low: lowest action; any shape with the same number of elements.
+        high: highest action; any shape with the same number of elements.
 
     Raises:
-        UserError: naming both shapes, where observations or actions differ.
+        UserError: naming both shapes, if observations or actions differ.
     """
     if not (callable(getattr(policy, "init", None)) and callable(getattr(policy, "step", None))):
         raise UserError(f"{type(policy).__name__} is not a policy: it needs init and step")
-    remedy = "use it on the kind of environment that it was made for"
+    remedy = "use the policy in the kind of environment that it was made for"
     expected = getattr(policy, "observation_size", observation_size)
     if expected != observation_size:
         raise UserError(
@@ -41,7 +41,7 @@ def check_compatible(
     constant = getattr(policy, "action", None)
     given = _action_shape(policy, observation_size)
     if isinstance(constant, jax.Array) and constant.size == int(np.prod(action_shape)):
-        return  # a constant is given flat
+        return  # a constant action may be flat
     if given is not None and given != action_shape:
         raise UserError(
             f"the policy's action has shape {given}, the environment's {action_shape}: {remedy}"
@@ -50,7 +50,7 @@ def check_compatible(
 
 
 def _action_shape(policy: PolicyLike, observation_size: int) -> tuple[int, ...] | None:
-    """The shape of the policy's action; None where it cannot be found out without playing."""
+    """The shape of the policy's action; None if it is not known before the policy is played."""
     if hasattr(policy, "action_shape"):
         return tuple(policy.action_shape)
     seen = jax.ShapeDtypeStruct((observation_size,), jnp.float32)
@@ -59,7 +59,7 @@ def _action_shape(policy: PolicyLike, observation_size: int) -> tuple[int, ...] 
         traced = jax.eval_shape(lambda k, o: policy.step(policy.init(k), o)[0], key, seen)
     except UserError:
         raise
-    except Exception:  # a policy that cannot be traced says so itself when it is played
+    except Exception:  # a policy that cannot be traced raises this error later, when it is played
         return None
     return getattr(traced, "shape", None)
 
@@ -78,6 +78,6 @@ def _warn_of_bounds(policy: PolicyLike, low: np.ndarray, high: np.ndarray) -> No
         warnings.warn(
             f"the policy's actions go from {own[0].tolist()} to {own[1].tolist()}, the "
             f"environment's from {there[0].tolist()} to {there[1].tolist()}: the same command may "
-            "mean another thing there",
+            "have another effect there",
             stacklevel=4,
         )

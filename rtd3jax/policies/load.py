@@ -1,4 +1,4 @@
-"""`load_policy`: a trained policy from a file, or from the directory of a sweep."""
+"""`load_policy`: loads a trained policy from a file, or from a run directory of the sweep."""
 
 import os
 from typing import TYPE_CHECKING, Any
@@ -22,20 +22,20 @@ def load_policy(
     disturbance: str | None = None,
     history_length: int | None = None,
 ) -> Policy:
-    """The policy of a file that ``policy.save`` wrote, or of one lane of a run directory.
+    """Load the policy of a file that ``policy.save`` wrote, or of one lane of a run directory.
 
     Args:
-        path: the file, or the directory that `rtd3jax.sweep` wrote. The other arguments choose
-            among a directory's lanes; those in which its cells agree need not be given.
-        algorithm: the agent's id.
-        seed: of the lane [0].
-        env: the environment's id.
-        disturbance: as it was given to the sweep.
+        path: the file, or the run directory that `rtd3jax.sweep` wrote. The other arguments choose
+            a lane of the directory; an argument is not necessary if all cells have the same value.
+        algorithm: the name of the agent.
+        seed: the seed of the lane [0].
+        env: the id of the environment.
+        disturbance: the disturbance, as in the command of the sweep.
         history_length: l.
 
     Raises:
-        UserError: when the file is missing, damaged or no policy; when the lane is missing, lost or
-            not trained yet; when several cells fit.
+        UserError: when the file is missing, damaged or not a policy; when the lane is missing, lost
+            or not trained yet; when several cells agree with the arguments.
     """
     given: dict[str, Any] = {
         "env": env,
@@ -53,10 +53,10 @@ def load_policy(
     if not is_directory:
         if given:
             raise UserError(
-                f"{path} is not a run directory, among whose lanes {', '.join(given)} would choose"
+                f"{path} is not a run directory: {', '.join(given)} cannot choose a lane of it"
             )
         return read_policy(path)
-    # Here, because it brings the libraries for tables and pictures, which playing does not need.
+    # Imported here: it imports libraries for tables, which a policy in a file does not need.
     from rtd3jax.study.rundir import RunDirectory
 
     directory = RunDirectory.open(path)
@@ -68,28 +68,28 @@ def load_policy(
 
 
 def _choose(directory: "RunDirectory", wanted: dict[str, Any]) -> "Cell":
-    """The one cell that is as ``wanted``."""
+    """The only cell that has the values ``wanted``."""
     cells = directory.cells
     for name, value in wanted.items():
         there = _values(cells, name)
         cells = [cell for cell in cells if cell.key[name] == value]
         if not cells:
             raise UserError(
-                f"{directory.path} has no such cell with {name}={value}; there {name} is "
-                f"{' or '.join(map(str, there))}"
+                f"{directory.path} has no such cell with {name}={value}; its values of {name} are "
+                f"{' and '.join(map(str, there))}"
             )
     for name in cells[0].key:
         there = _values(cells, name)
         if len(there) > 1:
             raise UserError(
-                f"{len(cells)} cells of {directory.path} fit; say which {name}: "
+                f"{len(cells)} cells of {directory.path} agree with the arguments; choose {name}: "
                 f"{', '.join(map(str, there))}"
             )
     if len(cells) > 1:
-        raise UserError(f"{len(cells)} cells of {directory.path} differ in other settings only")
+        raise UserError(f"{len(cells)} cells of {directory.path} only differ in other settings")
     return cells[0]
 
 
 def _values(cells: "list[Cell]", name: str) -> list[Any]:
-    """What ``name`` is in these cells."""
+    """The values of ``name`` in these cells."""
     return list(dict.fromkeys(cell.key[name] for cell in cells))

@@ -1,4 +1,4 @@
-"""Policies from arrays that were written down: checked, then made whole."""
+"""Reads saved policies: checks their arrays and headers, and restores the policies."""
 
 import math
 import os
@@ -26,20 +26,20 @@ from rtd3jax.system.files import flatten, read_arrays, unflatten
 _FORMATS = (1, FORMAT, CARRY_FORMAT, NORMALISED_FORMAT)
 _ACTIONS = ("action", "previous_action")
 _OLD_NAME = re.compile(r"^lstm\.")
-"""How the memory's arrays began when the LSTM was the only one."""
+"""Prefix of the memory's arrays in files of versions whose only memory was the LSTM."""
 
 
 def read_policy(path: str | os.PathLike) -> Policy:
     """The policy that `Policy.save` wrote.
 
     Raises:
-        UserError: when the file is missing, damaged, something else, of a newer format, or does not
-            hold the arrays that its header announces.
+        UserError: when the file is missing, damaged, of another kind or of a newer format, or when
+            its arrays do not agree with its header.
     """
     arrays, metadata = read_arrays(path)
     if isinstance(metadata, dict) and "cell" in metadata and "seed" in metadata:
         raise UserError(
-            f"{path} is a lane of a run directory and no saved policy: load it with "
+            f"{path} is a lane of a run directory, not a saved policy: load it with "
             f"load_policy({str(Path(path).parents[2])!r}, algorithm=..., seed={metadata['seed']})"
         )
     if not isinstance(metadata, dict) or metadata.get("kind") != KIND:
@@ -47,12 +47,12 @@ def read_policy(path: str | os.PathLike) -> Policy:
     if metadata.get("format") not in _FORMATS:
         raise UserError(
             f"{path} has format {metadata.get('format')}, and this version of rtd3jax reads up to "
-            f"{NORMALISED_FORMAT}: use the version that wrote it, or a newer one"
+            f"{NORMALISED_FORMAT}: use the version that wrote the file, or a newer version"
         )
     interface, facts = _header(path, metadata)
     normaliser = below(arrays, "normaliser")
     if (metadata["format"] == NORMALISED_FORMAT) != bool(normaliser):
-        raise UserError(f"{path} is damaged: its arrays do not go with its format")
+        raise UserError(f"{path} is damaged: its arrays do not agree with its format")
     actor = {name: array for name, array in arrays.items() if not name.startswith("normaliser.")}
     return restore_policy(path, actor, interface, normaliser=normaliser, **facts)
 
@@ -71,23 +71,23 @@ def restore_policy(
     centre_token: np.ndarray | None = None,
     normaliser: Mapping[str, np.ndarray] | None = None,
 ) -> Policy:
-    """The policy of an actor's arrays under dotted names.
+    """The policy from an actor's arrays under dotted names.
 
     Args:
-        path: where they come from, for messages.
+        path: the file of the arrays, for messages.
         actor: the arrays.
-        interface: of the environment that the policy is for.
-        algorithm: the agent's id.
+        interface: sizes and bounds of the policy's environment.
+        algorithm: the name of the agent.
         history_length: l; 0 for td3.
         width: H.
-        memory: the name of its recurrent cell.
+        memory: the name of the recurrent cell.
         acting: ``window`` or ``carry``, as in the policy.
-        format: of the file; an actor of format 1 is converted.
+        format: the format of the file; an actor of format 1 is converted.
         centre_token: [A], as in the policy; zero by default.
-        normaliser: its ``mean`` and ``scale`` [O]; None or empty without one.
+        normaliser: ``mean`` and ``scale`` [O] of the normaliser; None or empty without one.
 
     Raises:
-        UserError: when an array is missing, too many, of another shape or type, or not finite.
+        UserError: when an array is missing, unexpected, not finite, or of another shape or type.
     """
     spec = AGENTS[algorithm].actor
     sizes = part_sizes(interface.observation_size, interface.action_size)
@@ -98,7 +98,7 @@ def restore_policy(
         jax.tree.map(lambda leaf: np.broadcast_to(np.float32(0), leaf.shape), shapes)
     )
     for name in sorted(expected.keys() ^ actor.keys()):
-        what = "lacks the array" if name in expected else "has an array too many:"
+        what = "lacks the array" if name in expected else "has an unexpected array:"
         raise UserError(f"{path} does not fit {algorithm}: it {what} {name}")
     for name, like in expected.items():
         array = actor[name]
@@ -107,7 +107,7 @@ def restore_policy(
             raise UserError(
                 f"{path} does not fit {algorithm} with {interface.observation_size} observation "
                 f"elements, {interface.action_size} action elements and width {width}: {name} has "
-                f"shape {list(array.shape)}, not {list(like.shape)}; it is {kind}"
+                f"shape {list(array.shape)}, not {list(like.shape)}; the policy is {kind}"
             )
         if array.dtype != np.float32:
             raise UserError(f"{path}: {name} is {array.dtype}, not float32")
@@ -136,7 +136,7 @@ def restore_policy(
 
 
 def below(arrays: Mapping[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
-    """The arrays whose dotted names begin with ``name``, without it."""
+    """The arrays whose dotted names begin with ``name``, which is removed from the names."""
     return {n.removeprefix(f"{name}."): a for n, a in arrays.items() if n.startswith(f"{name}.")}
 
 
@@ -159,10 +159,9 @@ def _normaliser(
 def _in_half_ranges(
     actor: Params, spec: NetworkSpec, sizes: dict[str, int], half_range: np.ndarray
 ) -> Params:
-    """An actor that read actions in the environment's units, as one that reads half ranges.
+    """Convert an actor that reads actions in the environment's units to half ranges.
 
-    A product with an action is one with the action in half ranges and weights times ``half_range``
-    [A].
+    The weights of actions are multiplied by ``half_range`` [A].
     """
     actor = dict(actor)
     for layer, parts in (("encoder", spec.memory), ("current", spec.current)):
@@ -174,18 +173,18 @@ def _in_half_ranges(
 
 
 def _header(path: str | os.PathLike, metadata: dict[str, Any]) -> tuple[Interface, dict[str, Any]]:
-    """What a file's header says, checked: the interface, and `restore_policy`'s other facts."""
+    """Check a file's header; return the interface and the other arguments of `restore_policy`."""
     wrong = f"{path} is damaged: its header's"
     algorithm, memory = metadata.get("algorithm"), metadata.get("memory", "lstm")
     if not isinstance(algorithm, str) or algorithm not in AGENTS:
         raise UserError(
             f"{path}: the agent {algorithm!r} is not known here, only {', '.join(AGENTS)}; "
-            "register yours with rtd.register_agent before you load it"
+            "register it with rtd.register_agent before you load the policy"
         )
     if memory not in MEMORIES:
         raise UserError(
             f"{path}: the memory {memory!r} is not known here, only {', '.join(MEMORIES)}; "
-            "register yours with rtd.register_memory before you load it"
+            "register it with rtd.register_memory before you load the policy"
         )
     acting = metadata.get("acting", "window")
     if acting not in ACTINGS:
@@ -212,10 +211,10 @@ def _header(path: str | os.PathLike, metadata: dict[str, Any]) -> tuple[Interfac
 
 
 def read_interface(path: str | os.PathLike, metadata: Mapping[str, Any]) -> Interface:
-    """Sizes and bounds in a file's header, checked.
+    """Check and return the sizes and bounds in a file's header.
 
     Raises:
-        UserError: when they are not such.
+        UserError: when they are not valid.
     """
     wrong = f"{path} is damaged: its header's"
     if not _is_count(metadata.get("observation_size"), 1):

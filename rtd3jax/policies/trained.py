@@ -1,4 +1,4 @@
-"""A trained policy outside the trainer."""
+"""`Policy`: a trained policy for use outside the trainer."""
 
 import os
 from typing import Any
@@ -22,28 +22,28 @@ from rtd3jax.system.files import array_bytes, check_target, flatten, write_new
 from rtd3jax.system.versions import versions_of
 
 FORMAT = 2
-"""Of saved policies; raised when older versions could not read them.
+"""Format of saved policies; it increases when older versions cannot read the files.
 
 Actors of format 1 read actions in the environment's units."""
 
 CARRY_FORMAT = 3
-"""Of saved policies that act with a running carry; else as `FORMAT`."""
+"""Format of saved policies that act with a running carry; otherwise equal to `FORMAT`."""
 
 NORMALISED_FORMAT = 4
-"""Of saved policies that normalise observations; else as `CARRY_FORMAT` says."""
+"""Format of saved policies that normalise observations, with or without a running carry."""
 
 KIND = "policy"
 
 
 @struct.dataclass
 class PolicyState:
-    """What a policy remembers within an episode.
+    """The state of a policy in an episode.
 
     Attributes:
-        steps: ring of the last L steps, as the networks read them; None where a carry runs on.
-        previous_action: [A], as tokens hold it; zero before the first step.
-        time: int32 [], steps done in the episode.
-        carry: the memory's, leaves [1, ...], where it runs on from the episode's start; else None.
+        steps: ring of the last L steps, normalised; None with a running carry.
+        previous_action: [A], in the units of tokens; zero before the first step.
+        time: int32 [], number of steps of the episode so far.
+        carry: the memory's running carry, leaves [1, ...]; None without one.
     """
 
     steps: Steps | None
@@ -54,22 +54,22 @@ class PolicyState:
 
 @struct.dataclass
 class Policy:
-    """A deterministic actor with its window; jittable and vmappable.
+    """A deterministic actor with its window; it works under jit and vmap.
 
     Attributes:
         actor: the actor's parameters.
         bounds: the range of the environment's action.
         history_length: int32 [], l.
-        centre_token: [A], what tokens hold for an action at the centre of its range: zero, but in
-            policies of format 1 the centre in half ranges.
-        algorithm: the agent's id.
+        centre_token: [A], the value in tokens for an action at the centre of its range: zero, but
+            for policies of format 1 the centre in half ranges.
+        algorithm: the name of the agent.
         window_tokens: past tokens in the window's arrays, at least l.
         observation_size: O.
         action_shape: shape of the environment's action.
-        memory: the name of its recurrent cell.
-        acting: ``window`` reads the last l steps at every step; ``carry`` goes on with the memory's
-            carry from the episode's start, which costs one token whatever l is.
-        normaliser: maps each observation before the network reads it; None for none.
+        memory: the name of the recurrent cell.
+        acting: ``window`` reads the last l steps at every step; ``carry`` updates the memory's
+            carry from the start of the episode, and reads one token per step for any l.
+        normaliser: normalises observations before the network reads them; None without one.
     """
 
     actor: Params
@@ -96,7 +96,7 @@ class Policy:
         return make_part(AGENTS[self.algorithm], "actor", self.memory, *sizes, self.width)
 
     def init(self, key: jax.Array | None = None) -> PolicyState:
-        """The state before an episode's first step; ``key`` is not needed."""
+        """The state before the first step of an episode; ``key`` is not used."""
         action_size = self.bounds.low.shape[0]
         runs_on = self.acting == "carry"
         return PolicyState(
@@ -109,14 +109,15 @@ class Policy:
         )
 
     def step(self, state: PolicyState, observation: jax.Array) -> tuple[jax.Array, PolicyState]:
-        """The action for ``observation`` [O], and the state that remembers both.
+        """The action for ``observation`` [O], and the next state, which contains both.
 
-        Outside `jax.jit` and `jax.vmap` it is compiled at the first call, and refuses readings that
-        are not finite. Where it is traced nothing can be refused: they are remembered.
+        Outside `jax.jit` and `jax.vmap`, this method is compiled at the first call, and refuses
+        observations that are not finite. In traced code it cannot refuse them, and they enter the
+        state.
 
         Raises:
-            UserError: when the observation has another size than those the policy was trained on,
-                or is not finite; nothing is remembered of it then.
+            UserError: when the observation is not finite, or has another size than in training; the
+                state then stays unchanged.
         """
         traced = any(
             isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((self, state, observation))
@@ -130,8 +131,8 @@ class Policy:
         self._check_shape(reading.shape)
         if not np.isfinite(reading).all():
             raise UserError(
-                f"the observation {reading.tolist()} is not finite, and nothing was remembered of "
-                "it: step with the last good reading, or start the episode anew with policy.init()"
+                f"the observation {reading.tolist()} is not finite, and the state is unchanged: "
+                "step with the last valid observation, or start a new episode with policy.init()"
             )
         return _compiled_step(self, state, reading)
 
@@ -142,7 +143,7 @@ class Policy:
         if len(shape) == 2 and shape[1:] == expected:
             raise UserError(
                 f"the policy steps one plant, with observations of shape {expected}, not {shape}: "
-                "give observation[0], or for a batch use jax.vmap(policy.step) with one state for "
+                "pass observation[0], or for a batch use jax.vmap(policy.step) with one state for "
                 "each plant"
             )
         raise UserError(
@@ -194,13 +195,13 @@ class Policy:
         write_new(path, array_bytes(self._arrays(), self._metadata()), overwrite)
 
     def export(self, path: str | os.PathLike, format: str, overwrite: bool = False) -> None:
-        """Write the policy in a form that runs without rtd3jax.
+        """Write the policy in a format that runs without rtd3jax.
 
         Args:
-            path: of the file.
+            path: the path of the file.
             format: ``onnx`` (needs the package onnx), ``stablehlo`` (needs flatbuffers; see
                 `rtd3jax.load_stablehlo`) or ``numpy`` (one Python file with a class ``Player``).
-            overwrite: replace a file that is there.
+            overwrite: whether to replace an existing file.
 
         Raises:
             UserError: as `save` does; for an unknown format; when its package is missing.
@@ -233,17 +234,17 @@ class Policy:
         write_new(path, content_of(model), overwrite)
 
     def _actor(self) -> Params:
-        """The parameters on the host, checked."""
+        """The parameters on the host, after a check that they are finite."""
         if self.history_length.ndim != 0:
             raise UserError("this is a batch of policies; save or export them one by one")
         actor = jax.tree.map(np.asarray, self.actor)
         for name, array in flatten(actor).items():
             if not np.all(np.isfinite(array)):
-                raise UserError(f"the policy's weights are not finite ({name}); it cannot be used")
+                raise UserError(f"the policy's weights are not finite ({name}); do not use it")
         return actor
 
     def _arrays(self) -> dict[str, np.ndarray]:
-        """What a saved policy holds."""
+        """The arrays of a saved policy."""
         return {**flatten(self._actor()), **self._normaliser_arrays()}
 
     def _normaliser_arrays(self) -> dict[str, np.ndarray]:
@@ -253,11 +254,11 @@ class Policy:
         return {f"normaliser.{n}": np.asarray(getattr(self.normaliser, n)) for n in names}
 
     def parameters(self) -> dict[str, np.ndarray]:
-        """All that was learned, under dotted names: ``actor...`` and ``normaliser...``."""
+        """All learned arrays under dotted names, ``actor...`` and ``normaliser...``."""
         return {**flatten(self.actor, "actor"), **self._normaliser_arrays()}
 
     def interface(self) -> dict[str, Any]:
-        """Sizes and bounds of the environment that it is for, as headers of files hold them."""
+        """Sizes and bounds of the policy's environment, as in the headers of files."""
         return {
             "observation_size": self.observation_size,
             "action_shape": list(self.action_shape),
@@ -272,7 +273,7 @@ class Policy:
         return CARRY_FORMAT if self.acting == "carry" else FORMAT
 
     def _metadata(self) -> dict[str, Any]:
-        """The header of a file that holds the policy."""
+        """The header of a saved policy."""
         return {
             "kind": KIND,
             "format": self._format,

@@ -163,7 +163,7 @@ def test_summary_and_picture(tmp_path):
     assert path.read_bytes().startswith(b"\x89PNG") and path.stat().st_size > 10_000
     with pytest.raises(UserError, match="exists"):
         fit.plot(path)
-    with pytest.raises(UserError, match=r"end its name in .png"):
+    with pytest.raises(UserError, match=r"use a name that ends in .png"):
         fit.plot(tmp_path / "fit.xyz")
     env = Rover(RoverParams(slip=fit.process, max_steps_in_episode=20))
     assert rtd.evaluate(rtd.bayes_policy(env), env, 2).shape == (2,)
@@ -193,7 +193,7 @@ def test_what_the_picture_shows():
         (np.arange(50.0) / 100, "ar1", {"max_slip": 0.3}, "less than the largest slip"),
         (np.arange(50.0) / 100, "ar1", {"max_slip": 3}, "at most 1"),
         (np.arange(50.0), "noise", {"max_slip": 0.5}, "max_slip is a parameter of ar1 and sine"),
-        (np.arange(50.0), "ornstein-uhlenbeck", {}, "wanders off without end"),
+        (np.arange(50.0), "ornstein-uhlenbeck", {}, "is not stationary"),
         (np.tile([0.0, 1.0], 30), "ornstein-uhlenbeck", {}, "has no memory, or alternates"),
         (np.repeat([0.0, 0.5], 30), "ar1", {}, "nearly all slip in the log is at a bound"),
         (rtd.Recorded(np.arange(50.0)), "noise", {"step": 1}, "for the log that was read"),

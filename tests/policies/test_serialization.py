@@ -115,7 +115,7 @@ def test_arrays_that_do_not_fit_are_refused(tmp_path, policy, change, message):
     "changes, message",
     [
         ({"format": 5}, "has format 5, .* reads up to 4"),
-        ({"format": 4}, "arrays do not go with its format"),
+        ({"format": 4}, "arrays do not agree with its format"),
         ({"centre_token": [0.0]}, "centre_token is not 2 numbers"),
         ({"kind": "shopping list"}, "is not a saved policy"),
         ({"algorithm": "ppo"}, "agent .ppo. is not known here"),
@@ -176,7 +176,7 @@ def test_a_reading_that_is_not_finite_is_refused_and_not_remembered(policy):
     size = policy.observation_size
     action, state = policy.step(state, np.full(size, 0.1))
     for bad in (np.nan, -np.inf, 1e300):
-        with pytest.raises(rtd.UserError, match="not finite, and nothing was remembered") as caught:
+        with pytest.raises(rtd.UserError, match="not finite, and the state is unchanged") as caught:
             policy.step(state, np.append(np.full(size - 1, 0.1), bad))
         assert "\n" not in str(caught.value)
     after, _ = policy.step(state, [0.1] * size)

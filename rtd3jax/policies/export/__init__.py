@@ -1,1 +1,1 @@
-"""A trained actor in forms that run without the trainer."""
+"""Exports trained actors to formats that run without the trainer."""

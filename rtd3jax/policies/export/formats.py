@@ -1,4 +1,4 @@
-"""The exported forms by name."""
+"""The export formats by name."""
 
 from collections.abc import Callable
 
@@ -13,11 +13,11 @@ FORMATS: dict[str, tuple[str, Callable[[Model], bytes]]] = {
     "stablehlo": (".stablehlo", stablehlo_bytes),
     "numpy": (".py", numpy_bytes),
 }
-"""A file's usual suffix, and what makes its content."""
+"""For each format, the usual suffix and the function that returns the content of a file."""
 
 
 def writer_of(format: str, path: str) -> Callable[[Model], bytes]:
-    """What makes the content of a file of ``format`` at ``path``.
+    """The function that returns the content of a file of ``format`` at ``path``.
 
     Raises:
         UserError: for an unknown format, or a numpy player that Python could not import.
@@ -28,5 +28,5 @@ def writer_of(format: str, path: str) -> Callable[[Model], bytes]:
             f"the formats are {', '.join(FORMATS)}"
         )
     if format == "numpy" and not path.endswith(".py"):
-        raise UserError(f"the numpy form is a Python file: {path} must end in .py")
+        raise UserError(f"the numpy format is a Python file: {path} must end in .py")
     return FORMATS[format][1]

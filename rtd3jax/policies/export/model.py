@@ -1,19 +1,18 @@
-"""An actor as plain arrays, folded for play, and the recurrence that all exported forms share.
+"""An actor as plain arrays, and the recurrence that all export formats share.
 
-Reading a sliding window anew at every step costs ``l`` dependent products. The same numbers come
-from ``l`` carries side by side, each begun at another step, which one product advances
-together. Between steps t-1 and t, row j - 1 of the state (j = 1..l) holds the carry after the
-tokens t-j..t-1. Step t puts a zero row in front, feeds its token to all rows, and drops the last.
+To read a sliding window at every step takes ``l`` sequential products. The same numbers follow from
+``l`` carries, each of which started at another step; one product advances all of them. Between
+steps t-1 and t, row j - 1 of the state (j = 1..l) holds the carry after the tokens t-j..t-1. Step t
+inserts a zero row at the front, feeds its token to all rows, and removes the last row. A row that
+would start before the episode starts at the episode's first token instead, with a zero carry. So
+**a state of zeros is the start of an episode**, and neither a counter nor a mask is needed. No row
+is older than the window.
 
-Rows that would have begun before the episode begin at its first token instead, with a zero carry:
-what does not exist leaves no trace. So **a state of zeros is the start of an episode**, and neither
-a counter nor a mask is needed. No row is ever older than the window.
+A policy with a running carry only has this carry, without an axis of rows, and reads one token per
+step, for any history length. Its state at the start of an episode is zero too.
 
-A policy that acts with a running carry has that one alone, without an axis of rows: one token a
-step, whatever the history length. Zeros are the start there too.
-
-Tokens hold actions in half ranges about the centre of the environment's range: the tanh of the
-output. Only the action that leaves is in the environment's units.
+Tokens hold actions in half ranges from the centre of the environment's range: the tanh of the
+output. Only the returned action is in the environment's units.
 
 Shapes: ``B`` batch, ``l`` history length, ``H`` width, ``O`` and ``A`` sizes of an observation and
 a flat action, ``D`` of a token.
@@ -33,29 +32,29 @@ from rtd3jax.agents.normalise import LIMIT, Normaliser
 from rtd3jax.errors import UserError
 
 GATES = "ifog"
-"""Order of the gates in a folded model: the three sigmoids stand together."""
+"""Order of the gates in a folded model: the three sigmoids are adjacent."""
 
 _TRAINED_GATES = "ifgo"
 
 
 @dataclasses.dataclass(frozen=True)
 class Model:
-    """What an exported form needs.
+    """The data of an actor that the export formats need.
 
     Attributes:
-        memory: parts of a token of the recurrent stream, of ``observation``, ``previous_action``
-            and ``action``; empty for none.
-        memory_has_current: whether that stream ends with the current token, so that the action
-            is computed from the carries after this step's token and not before it.
-        current: parts of the feed-forward stream's input; empty for none.
+        memory: parts of a token of the recurrent stream, from ``observation``, ``previous_action``
+            and ``action``; empty without this stream.
+        memory_has_current: whether the recurrent stream ends with the current token, so that the
+            action is computed from the carries after this token.
+        current: parts of the input of the feed-forward stream; empty without this stream.
         history_length: l.
         observation_size: O.
         action_shape: shape of the environment's action, A elements.
-        arrays: of `fold`.
-        metadata: JSON-ready facts that travel with the file.
-        cell: the name of its memory; None without one.
-        network: the actor as a module, for the form that traces it.
-        params: its parameters.
+        arrays: the arrays from `fold`.
+        metadata: JSON-ready facts for the header of the file.
+        cell: the name of the memory; None without a memory.
+        network: the actor as a module, for the format that traces it.
+        params: the actor's parameters.
         acting: ``window`` or ``carry``, as in the policy.
     """
 
@@ -74,7 +73,7 @@ class Model:
 
     @property
     def runs_on(self) -> bool:
-        """Whether the carry runs on from the episode's start."""
+        """Whether the policy acts with a running carry from the start of the episode."""
         return self.acting == "carry"
 
     @property
@@ -89,7 +88,7 @@ class Model:
 
     @property
     def state_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shapes of the state's parts for one episode, in the order in which files list them."""
+        """Shapes of the parts of the state for one episode, in the order of the files."""
         shapes: dict[str, tuple[int, ...]] = {}
         for name, shape in carry_shapes(self.network).items():
             shapes[name] = shape if self.runs_on else (self.history_length, *shape)
@@ -118,15 +117,16 @@ def fold(
     centre_token: ArrayLike,
     normaliser: Normaliser | None = None,
 ) -> dict[str, np.ndarray]:
-    """An actor's parameters as float32 arrays: an LSTM's biases merged, its gates as in `GATES`.
+    """An actor's parameters as float32 arrays, with merged LSTM biases and gates as in `GATES`.
 
     Args:
         actor: nested parameters of a trained actor.
-        cell: the name of its memory; None without one.
-        low: [A], the action's lower bound.
-        high: [A], its upper bound.
-        centre_token: [A], what tokens hold for an action at the centre; left out where it is zero.
-        normaliser: of observations; left out where there is none.
+        cell: the name of the memory; None without a memory.
+        low: [A], the lower bound of the action.
+        high: [A], the upper bound of the action.
+        centre_token: [A], the value in tokens for an action at the centre of its range; not among
+            the arrays if it is zero.
+        normaliser: the normalisation of observations, or None.
     """
     arrays: dict[str, ArrayLike] = {}
     for layer in ("encoder", "current", "head", "output"):
@@ -160,11 +160,11 @@ def _reorder(array: np.ndarray) -> np.ndarray:
 
 
 PORTABLE = ("lstm", "gru", "min-gru")
-"""Memories that the forms numpy and ONNX know; StableHLO takes any."""
+"""Memories that the formats numpy and ONNX support; StableHLO supports any memory."""
 
 
 def carry_shapes(network: Network) -> dict[str, tuple[int, ...]]:
-    """The parts of a memory's carry for one episode: their names and shapes."""
+    """Names and shapes of the parts of a memory's carry for one episode."""
     carry = jax.eval_shape(lambda: network.zero_carry(1))
     leaves = jax.tree_util.tree_leaves_with_path(carry)
     if len(leaves) == 1:
@@ -176,14 +176,14 @@ def carry_shapes(network: Network) -> dict[str, tuple[int, ...]]:
 
 
 def check_portable(model: Model, form: str) -> None:
-    """Raise UserError where ``form`` does not know the model's memory or one of its layers."""
+    """Raise UserError if the format ``form`` does not support the model's memory or encoder."""
     if model.cell is not None and model.cell not in PORTABLE:
         raise UserError(
-            f"the form {form} knows the memories {', '.join(PORTABLE)}, not {model.cell!r}; "
+            f"the format {form} supports the memories {', '.join(PORTABLE)}, not {model.cell!r}; "
             "export the policy as stablehlo"
         )
     layers = (model.network.encoder, model.network.current)
     if any(layer is not None and not isinstance(layer, Linear) for layer in layers):
         raise UserError(
-            f"the form {form} does not know this agent's encoder; export the policy as stablehlo"
+            f"the format {form} does not support this agent's encoder; export it as stablehlo"
         )

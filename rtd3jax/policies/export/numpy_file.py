@@ -1,11 +1,11 @@
-"""The numpy form: one Python file, `rtd3jax.policies.export.player` with the weights in it."""
+"""The numpy format: a Python file, `rtd3jax.policies.export.player` with the weights in it."""
 
 import base64
 import importlib.resources
 
 from rtd3jax.policies.export.model import Model, check_portable
 
-_ABOUT = "ABOUT: dict[str, Any] = {}\n"
+_HEADER = "HEADER: dict[str, Any] = {}\n"
 _WEIGHTS = 'WEIGHTS = ""\n'
 
 
@@ -21,8 +21,8 @@ def numpy_bytes(model: Model) -> bytes:
         .joinpath("player.py")
         .read_text("utf-8")
     )
-    assert source.count(_ABOUT) == 1 and source.count(_WEIGHTS) == 1
-    source = source.replace(_ABOUT, f"ABOUT: dict[str, Any] = {metadata}\n")
-    # Last, so that no text of the header can be taken for the mark.
+    assert source.count(_HEADER) == 1 and source.count(_WEIGHTS) == 1
+    source = source.replace(_HEADER, f"HEADER: dict[str, Any] = {metadata}\n")
+    # The weights come last, so that no text in the header can be mistaken for their mark.
     head, tail = source.split(_WEIGHTS)
     return f'{head}WEIGHTS = """\n{text}"""\n{tail}'.encode()

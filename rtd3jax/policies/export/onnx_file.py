@@ -1,6 +1,6 @@
-"""The ONNX form: ``(observation, state...) -> (action, next state...)``, any batch size.
+"""The ONNX format: ``(observation, state...) -> (action, next state...)``, any batch size.
 
-Plain operators of opset 17, so that old runtimes play it too.
+The graph only uses standard operators of opset 17, so that old runtimes support it.
 """
 
 import json
@@ -22,7 +22,7 @@ METADATA = "rtd3jax"
 def onnx_bytes(model: Model) -> bytes:
     """The serialised graph.
 
-    Inputs: ``observation`` [B, O] and the parts of `Model.state_shapes`, each behind a batch axis.
+    Inputs: ``observation`` [B, O] and the parts of `Model.state_shapes`, each with a batch axis.
     Outputs: ``action`` [B, *action_shape] and ``next_...`` for each part.
 
     Raises:
@@ -60,7 +60,7 @@ def onnx_bytes(model: Model) -> bytes:
 
 
 class _Graph:
-    """Nodes in the order in which they were added, and the constants that they use."""
+    """Nodes in the order of their addition, and their constants."""
 
     def __init__(self, helper: ModuleType, arrays: dict[str, np.ndarray]):
         self._helper = helper
@@ -69,28 +69,28 @@ class _Graph:
         self.constants: dict[str, np.ndarray] = {}
 
     def add(self, operator: str, inputs: Sequence[str], *outputs: str, **attributes: object) -> str:
-        """Add a node; the name of its first output."""
+        """Add a node; return the name of its first output."""
         names = outputs or (f"{operator.lower()}_{len(self.nodes)}",)
         self.nodes.append(self._helper.make_node(operator, inputs, names, **attributes))
         return names[0]
 
     def weight(self, name: str) -> str:
-        """A folded array."""
+        """The name of a folded array."""
         self.constants[name] = self._arrays[name]
         return name
 
     def integers(self, *values: int) -> str:
-        """A vector of integers."""
+        """The name of a vector of integers."""
         name = "integers_" + "_".join(map(str, values))
         self.constants[name] = np.asarray(values, np.int64)
         return name
 
     def linear(self, layer: str, x: str) -> str:
-        """``x`` [B, inputs] through a layer."""
+        """Apply a layer to ``x`` [B, inputs]."""
         return self.add("Gemm", [x, self.weight(f"{layer}_kernel"), self.weight(f"{layer}_bias")])
 
     def join(self, parts: Sequence[str]) -> str:
-        """Parts [B, ...] side by side."""
+        """Concatenate parts [B, ...] along the last axis."""
         return parts[0] if len(parts) == 1 else self.add("Concat", parts, axis=1)
 
 
@@ -102,7 +102,7 @@ def _build(graph: _Graph, model: Model) -> None:
     if model.memory:
         carry = [*_CARRIES[model.cell]]
         if not model.runs_on:
-            pads = graph.integers(0, 1, 0, 0, 0, 0)  # a zero row: the carry that begins now
+            pads = graph.integers(0, 1, 0, 0, 0, 0)  # a zero row: the carry that starts here
             carry = [graph.add("Pad", [part, pads]) for part in carry]
         if model.memory_has_current:
             carry = _feed(graph, model, carry, observation)
@@ -138,7 +138,7 @@ _CARRIES: dict[str | None, tuple[str, ...]] = {
 
 
 def _normalised_observation(graph: _Graph, model: Model) -> str:
-    """The observation as the network reads it."""
+    """The normalised observation."""
     if "observation_mean" not in model.arrays:
         return "observation"
     limit = graph.weight("observation_limit")
@@ -148,16 +148,16 @@ def _normalised_observation(graph: _Graph, model: Model) -> str:
 
 
 def _named(parts: Sequence[str], **names: str) -> list[str]:
-    """Names of the values that hold these parts of a token."""
+    """Names of the values of these parts of a token."""
     return [names.get(part, part) for part in parts]
 
 
 def _feed(
     graph: _Graph, model: Model, carry: list[str], observation: str, action: str = ""
 ) -> list[str]:
-    """The carries [B, rows, H], or [B, H] of one that runs on, after the step's token.
+    """The carries [B, rows, H] after the step's token; a running carry is [B, H].
 
-    ``action`` is for where a token has it.
+    ``action`` is for tokens that contain the action.
     """
     parts = _named(model.memory, observation=observation, action=action)
     token = graph.add("Relu", [graph.linear("encoder", graph.join(parts))])

@@ -1,13 +1,13 @@
-"""A trained policy that needs nothing but numpy.
+"""A trained policy that only needs numpy.
 
     player = Player()
     player.reset()                       # at the start of every episode
     action = player.step(observation)    # once per control step
 
-`ABOUT` says what the policy is. The window that the agent reads is kept as carries of its
-memory side by side, each begun at another of the last steps; one product advances them all, and the
-last row is the one that has read the whole window. A policy whose carry runs on from the episode's
-start has that one alone. Carries of zeros are the start of an episode.
+`HEADER` describes the policy. The player keeps a carry of the agent's memory for each of the last
+steps, at which the carry started. One product advances all carries, and the last row has read the
+whole window. A policy with a running carry from the start of the episode only has this carry.
+Carries of zeros are the start of an episode.
 """
 
 import base64
@@ -15,19 +15,19 @@ from typing import Any
 
 import numpy as np
 
-ABOUT: dict[str, Any] = {}
+HEADER: dict[str, Any] = {}
 WEIGHTS = ""
 
 
 class Player:
-    """The policy, with one episode's state; use one player for each plant.
+    """The policy with the state of one episode; use a separate player for each plant.
 
     Args:
-        metadata: the policy's header; the file's own by default.
-        weights: base64 of its arrays, float32 and little-endian, in the header's order.
+        metadata: the header of the policy; that of this file by default.
+        weights: the arrays in base64, float32 and little-endian, in the order of the header.
     """
 
-    def __init__(self, metadata: dict[str, Any] = ABOUT, weights: str = WEIGHTS) -> None:
+    def __init__(self, metadata: dict[str, Any] = HEADER, weights: str = WEIGHTS) -> None:
         self.metadata = metadata
         self.observation_size: int = metadata["observation_size"]
         self.action_shape: tuple[int, ...] = tuple(metadata["action_shape"])
@@ -50,14 +50,14 @@ class Player:
             self._advance = {"lstm": self._lstm, "gru": self._gru, "min-gru": self._min_gru}[
                 metadata["cell"]
             ]
-            # sigmoid(x) = tanh(x / 2) / 2 + 1/2: halved here, all gates are one tanh.
+            # sigmoid(x) = tanh(x / 2) / 2 + 1/2: with halved weights, one tanh computes all gates.
             gates = {"lstm": (0.5, 0.5, 0.5, 1.0), "gru": (0.5, 0.5, 1.0), "min-gru": (0.5, 1.0)}
             half = np.repeat(np.array(gates[metadata["cell"]], np.float32), width)
             self._input = arrays["input_kernel"] * half, arrays["input_bias"] * half
             if "recurrent_kernel" in arrays:
                 self._recurrent = arrays["recurrent_kernel"] * half
                 self._recurrent_bias = arrays.get("recurrent_bias", np.float32(0.0)) * half
-            # Row 0 is zero for ever, the carry that begins with a token, unless one runs on.
+            # Row 0 is always zero: the carry that starts at a step. A running carry has no row 0.
             self._first = 0 if self._runs_on else 1
             self._rows = 1 if self._runs_on else self._length + self._with_current
             self._gates = np.empty((self._rows, half.size), np.float32)
@@ -66,18 +66,18 @@ class Player:
         self.reset()
 
     def reset(self) -> None:
-        """Forget: the next step is the first of an episode."""
+        """Begin an episode: the next step is its first step."""
         self._previous_action = np.zeros_like(self._centre)
         if self.metadata["memory"]:
             self._hidden[:] = 0.0
             self._cell[:] = 0.0
 
     def step(self, observation: Any) -> np.ndarray:
-        """The action for ``observation`` [O], in the environment's units, of `action_shape`.
+        """The action of shape `action_shape`, in the environment's units, for ``observation`` [O].
 
         Raises:
-            ValueError: when the observation has another size or is not finite; nothing is
-                remembered of it then.
+            ValueError: when the observation has another size or is not finite; the state then stays
+                unchanged.
         """
         observation = np.asarray(observation, np.float32)
         if observation.shape != (self.observation_size,):
@@ -108,7 +108,7 @@ class Player:
         return action.reshape(self.action_shape)
 
     def _feed(self, parts: dict[str, np.ndarray]) -> np.ndarray:
-        """Give all carries the step's token; the hidden state of the one that began first."""
+        """Advance all carries with the step's token; return the output of the oldest carry."""
         kernel, bias = self._input
         token = self._relu("encoder", _join(parts, self.metadata["memory"])) @ kernel + bias
         hidden = self._advance(token, self._hidden[: self._rows])

@@ -1,4 +1,4 @@
-"""The StableHLO form: a portable XLA program of any batch size, run by any later JAX.
+"""The StableHLO format: a portable XLA program for any batch size and later versions of JAX.
 
 The file is a safetensors file with one array of bytes, ``program``, and the policy's header.
 """
@@ -20,7 +20,7 @@ from rtd3jax.policies.export.model import Model, carry_shapes
 from rtd3jax.system.files import array_bytes, read_arrays
 
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
-"""Where the program may run."""
+"""Platforms on which the program can run."""
 
 FORMAT = 1
 _KIND = "stablehlo"
@@ -29,13 +29,13 @@ State = dict[str, jax.Array]
 
 
 def stablehlo_bytes(model: Model) -> bytes:
-    """The file of ``(state, observation [B, O]) -> (action [B, *action_shape], state)``.
+    """The file with ``(state, observation [B, O]) -> (action [B, *action_shape], state)``.
 
     Raises:
         UserError: when the package flatbuffers is missing.
     """
     _require_flatbuffers()
-    # Here, not within what is traced, where the order of constants would be left to chance.
+    # Outside the traced function, in which the order of constants would not be fixed.
     params = jax.tree.map(jnp.asarray, model.params)
     arrays = {name: jnp.asarray(array) for name, array in model.arrays.items()}
     (batch,) = jax.export.symbolic_shape("batch")
@@ -44,7 +44,7 @@ def stablehlo_bytes(model: Model) -> bytes:
         return jax.ShapeDtypeStruct((batch, *shape), jnp.float32)
 
     def policy_step(state: State, observation: jax.Array) -> tuple[jax.Array, State]:
-        # Accelerators would otherwise round products of float32 to fewer bits.
+        # Otherwise accelerators would round the factors of float32 products to fewer bits.
         with jax.default_matmul_precision("highest"):
             return play(model, params, arrays, state, observation)
 
@@ -63,8 +63,8 @@ def play(
 ) -> tuple[jax.Array, State]:
     """The recurrence of `rtd3jax.policies.export.model` for ``observation`` [B, O].
 
-    Any memory and any layers do. The carries that stand side by side are a batch for the memory's
-    own step.
+    It works for any memory and any layers. The rows of carries are a batch for the memory's method
+    ``step``.
     """
     network, variables = model.network, {"params": params}
     parts = {"observation": _normalised(observation, arrays)}
@@ -126,13 +126,13 @@ def _normalised(observation: jax.Array, arrays: State) -> jax.Array:
 
 
 def _with_zero_row(rows: jax.Array) -> jax.Array:
-    """``rows`` [B, l, ...] behind a row of zeros: the carry that begins now."""
+    """``rows`` [B, l, ...] after a row of zeros, the carry that starts at this step."""
     return jnp.pad(rows, ((0, 0), (1, 0), *[(0, 0)] * (rows.ndim - 2)))
 
 
 @contextlib.contextmanager
 def _no_source_locations() -> Iterator[None]:
-    """Keep the caller's source lines, and so this machine's paths, out of the program."""
+    """Keep source locations, and so this machine's paths, out of the program."""
     option = "jax_traceback_in_locations_limit"
     limit = getattr(jax.config, option)
     jax.config.update(option, 0)
@@ -152,7 +152,7 @@ def _require_flatbuffers() -> None:
 
 
 class StableHlo:
-    """A policy loaded from a StableHLO file; jittable, batched.
+    """A policy loaded from a StableHLO file; it takes batches, and can be called under jit.
 
     Attributes:
         metadata: the file's header.
@@ -190,13 +190,13 @@ def load_stablehlo(path: str | os.PathLike) -> StableHlo:
     """The policy that ``policy.export(path, format="stablehlo")`` wrote.
 
     Raises:
-        UserError: when the file is missing, damaged, something else, or of a newer format; when
+        UserError: when the file is missing, damaged, of another kind, or of a newer format; when
             the package flatbuffers is missing.
     """
     _require_flatbuffers()
     arrays, metadata = read_arrays(path)
     if not isinstance(metadata, dict) or metadata.get("kind") != _KIND or "program" not in arrays:
-        raise UserError(f"{path} is not a policy in StableHLO")
+        raise UserError(f"{path} is not a policy in the StableHLO format")
     if metadata.get("format") != FORMAT:
         raise UserError(
             f"{path} has format {metadata.get('format')}, and this version of rtd3jax reads format "
@@ -204,7 +204,7 @@ def load_stablehlo(path: str | os.PathLike) -> StableHlo:
         )
     try:
         exported = jax.export.deserialize(bytearray(arrays["program"].tobytes()))
-    except Exception as error:  # of many kinds, and all mean the same
+    except Exception as error:  # JAX raises many types of errors here
         reason = first_line(error)
         raise UserError(f"{path} cannot be read by this version of JAX ({reason})") from error
     return StableHlo(metadata, exported)

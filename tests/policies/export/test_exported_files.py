@@ -144,7 +144,7 @@ def test_what_is_no_stablehlo_policy_is_refused(program, tmp_path, policy):
     with pytest.raises(rtd.UserError, match="cannot be read"):
         rtd.load_stablehlo(path)
     policy.save(path, overwrite=True)
-    with pytest.raises(rtd.UserError, match="is not a policy in StableHLO"):
+    with pytest.raises(rtd.UserError, match="is not a policy in the StableHLO"):
         rtd.load_stablehlo(path)
     with pytest.raises(rtd.UserError, match="is not a saved policy"):
         rtd.load_policy(program)
