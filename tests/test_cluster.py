@@ -180,8 +180,8 @@ def scheduling(monkeypatch):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"jax": "0.1"}, "has jax 0.1, here it is"),
-        ({}, "does not see"),
+        ({"jax": "0.1"}, "has jax 0.1, but this process has"),
+        ({}, "cannot read"),
     ],
 )
 @pytest.mark.usefixtures("scheduling")

@@ -14,7 +14,7 @@ import rtd3jax as rtd
     ("change", "message"),
     [
         ({"algorithm": "lstm-td3-1ha1h"}, "did you mean 'lstm-td3-1ha1hc'"),
-        ({"precision": "float16"}, "precision 'float16' is unknown.*float32 and bfloat16"),
+        ({"precision": "float16"}, "precision 'float16' is unknown.*float32 or bfloat16"),
         ({"batch_size": 0}, "batch_size must be at least 1"),
         ({"total_steps": -3}, "total_steps must be at least 1"),
         ({"total_steps": 2.5}, "total_steps must be an integer"),

@@ -65,7 +65,7 @@ def test_a_run_directory_holds_what_it_should(tmp_path, capsys, monkeypatch):
         del cell["actor_noise"]
     (out / "config.json").write_text(json.dumps(study))
     assert sweep.main([*TINY, "--out", str(out)]) == 0
-    assert "3 of 4 lanes are there already" in capsys.readouterr().out
+    assert "3 of 4 lanes have ended already" in capsys.readouterr().out
     assert lane.read_bytes() == kept and _files(out, *tables) == before
 
     # Another study does not go there; a broken lane is named.

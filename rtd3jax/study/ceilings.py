@@ -1,4 +1,4 @@
-"""Ceilings of a study's environments, kept in its run directory once they are computed."""
+"""Ceilings of a study's environments, which the run directory stores."""
 
 import json
 import sys
@@ -20,9 +20,9 @@ FILE = "ceilings.json"
 def ceilings_of(
     directory: Path, cells: Sequence[Cell], *, compute: bool
 ) -> dict[tuple[str, str], dict[str, Any]]:
-    """Of each (env, disturbance): mean, standard error and kind, or the reason for having none.
+    """For each (env, disturbance), the mean, standard error and kind, or why there is no ceiling.
 
-    Without ``compute``, only those that were computed before, by this version.
+    Without ``compute``, only stored ceilings of this version are returned.
     """
     path = directory / FILE
     version = versions_of(["rtd3jax"])["rtd3jax"]
@@ -44,7 +44,7 @@ def ceilings_of(
 
 
 def compute_ceilings(directory: Path, cells: Sequence[Cell]) -> None:
-    """Compute and keep what is missing if that can be done; a sweep goes on in any case."""
+    """Compute and store the missing ceilings; an error is printed, and the sweep continues."""
     try:
         ceilings_of(directory, cells, compute=True)
     except Exception as error:
@@ -67,5 +67,5 @@ def _read(path: Path, version: str) -> dict[str, dict[str, Any]]:
                 if {"mean", "error", "kind"} <= set(entry)
             }
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        pass  # another version's, or none
+        pass  # there is no file, or another version wrote it
     return {}

@@ -1,8 +1,8 @@
 """The cells of a sweep as tasks of a Ray cluster.
 
-Ray schedules, watches over its nodes and starts a task again when its worker or node dies; the run
-directory on shared storage holds what is done, so that a task that is started again goes on from
-its lanes' checkpoints. The driver holds the directory's lock, watches, and makes the tables.
+Ray schedules the tasks, monitors its nodes, and restarts a task when its worker or node dies. The
+run directory is on shared storage, so a restarted task continues from the checkpoints of its lanes.
+The driver holds the lock of the directory, monitors the tasks, and writes the tables.
 """
 
 import contextlib
@@ -39,16 +39,16 @@ from rtd3jax.training.checkpoint import checkpoint_steps
 from rtd3jax.training.lanes import Job, workers
 
 TASKS = "cluster.jsonl"
-"""A line per task that ended: its cell, where and when it ran, and from which steps it went on."""
+"""File with a line per ended task: its cell, node and times, and the steps of its checkpoints."""
 _POLL_SECONDS = 0.1
 _KNOCK_SECONDS = 10.0
 _PROCESS_BYTES = 700 * 2**20
-"""Of a worker before it has a lane: Python, JAX and its compiled programs."""
+"""Memory of a worker without lanes: Python, JAX and compiled programs."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Need:
-    """What a task asks of its node; ``memory`` in bytes."""
+    """The resources that a task needs; ``memory`` is in bytes."""
 
     cpus: int
     gpus: int
@@ -65,20 +65,20 @@ def train_on_cluster(
     address: str,
     imports: Sequence[str],
 ) -> None:
-    """Train the lanes that are not done, a Ray task for each cell.
+    """Train the lanes that have not ended, with a Ray task for each cell.
 
     Args:
-        directory: the run, on storage that every node sees under the same path.
+        directory: the run directory, on storage that has the same path on every node.
         jobs: all lanes of the run.
-        work: how they are trained.
-        complaints: gains a line for each lane or cell that fails.
-        references: for the tables that are made meanwhile.
-        logger: of trackers, fed by this process.
-        address: ``auto``, or of the cluster.
+        work: options of the training.
+        complaints: list to which a line is added for each lane or cell that fails.
+        references: policies without training, for the interim tables.
+        logger: the trackers, to which this process sends rows.
+        address: the address of the cluster, or ``auto``.
         imports: modules that register environments.
 
     Raises:
-        UserError: when there is no cluster, its nodes cannot do the work, or Ray is not installed.
+        UserError: when there is no cluster, no node has the resources, or Ray is not installed.
     """
     waiting: dict[Cell, list[Job]] = {}
     for job in waiting_jobs(directory, jobs):
@@ -97,7 +97,7 @@ def train_on_cluster(
                 "num_cpus": need.cpus,
                 "num_gpus": need.gpus,
                 "memory": need.memory,
-                "max_retries": -1,  # of workers and nodes that die; what raises is not tried again
+                "max_retries": -1,  # if workers or nodes die, not after an error
                 "name": label(members[0]),
             }
             path = str(directory.path.resolve())
@@ -122,8 +122,8 @@ def _ray() -> Any:
 
 @contextlib.contextmanager
 def _connected(ray: ModuleType, address: str) -> Iterator[None]:
-    # A task may use fewer GPUs than its node has: Ray hides the others, and shall not hide all
-    # from a task that asks for none.
+    # Ray hides from a task the GPUs that it does not request. With this variable, Ray does not hide
+    # all GPUs from a task that requests none.
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     try:
         _knock(address)
@@ -141,14 +141,14 @@ def _connected(ray: ModuleType, address: str) -> Iterator[None]:
 
 
 def _knock(address: str) -> None:
-    """Ray itself tries for minutes where nobody listens."""
+    """Raise an error at once if nothing listens at ``address``: Ray would retry for minutes."""
     host, colon, port = address.rpartition("://")[2].rpartition(":")
     if colon:
         socket.create_connection((host.strip("[]"), int(port)), timeout=_KNOCK_SECONDS).close()
 
 
 def _need(members: Sequence[Job], work: Work, nodes: Sequence[dict]) -> Need:
-    """The lanes of a cell side by side, on as many cores as the largest node has for them.
+    """The resources for the lanes of a cell, on at most the cores of the largest node.
 
     Raises:
         UserError: for a cell that no node can hold.
@@ -160,7 +160,7 @@ def _need(members: Sequence[Job], work: Work, nodes: Sequence[dict]) -> Need:
     state, working = job_bytes(members[:1]).popitem()[1]
     gpus = 1 if work.strategy == "vmap" else 0
     cpus = min(len(members), int(most["CPU"])) if work.strategy == "map" else 1
-    # Under `map` finished chunks leave states behind for all lanes, and work on some.
+    # Under `map`, all lanes need memory for their states, and those that run for their work.
     size = math.ceil(_PROCESS_BYTES + len(members) * state + max(cpus, 1) * working)
     need = Need(cpus, gpus, size)
     asked = {"CPU": max(need.cpus, 1), "GPU": need.gpus, "memory": need.memory}
@@ -168,7 +168,7 @@ def _need(members: Sequence[Job], work: Work, nodes: Sequence[dict]) -> Need:
         if amount > most[name]:
             scale, unit = (2**20, " MiB") if name == "memory" else (1, "")
             raise UserError(
-                f"--cluster: {label(members[0])} needs {amount / scale:,.0f}{unit} {name}, the "
+                f"--cluster: {label(members[0])} needs {amount / scale:,.0f}{unit} {name}, but the "
                 f"largest node has {most[name] / scale:,.0f}{unit}"
             )
     return need
@@ -177,10 +177,10 @@ def _need(members: Sequence[Job], work: Work, nodes: Sequence[dict]) -> Need:
 def _check_nodes(
     ray: ModuleType, nodes: Sequence[dict], directory: RunDirectory, imports: Sequence[str]
 ) -> None:
-    """Ask every node for its versions, and whether it sees the run directory.
+    """Check the versions of every node, and its access to the run directory.
 
     Raises:
-        UserError: naming the node and what is wrong there.
+        UserError: naming the node and its problem.
     """
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
@@ -202,7 +202,7 @@ def _check_nodes(
                 versions, seen, problem = ray.get(answer, timeout=300)
             except Exception as error:
                 if node["NodeID"] not in [other["NodeID"] for other in _alive(ray)]:
-                    continue  # it died shortly before, and Ray had not noticed yet
+                    continue  # the node died, and Ray had not noticed it yet
                 reason = str(error).strip().splitlines()[-1]
                 raise UserError(f"--cluster: node {name} cannot work: {reason}") from error
             if problem:
@@ -210,12 +210,12 @@ def _check_nodes(
             for package, version in mine.items():
                 if versions.get(package) != version:
                     raise UserError(
-                        f"--cluster: node {name} has {package} {versions.get(package)}, here it "
-                        f"is {version}; install the same versions"
+                        f"--cluster: node {name} has {package} {versions.get(package)}, but this "
+                        f"process has {version}; install the same versions"
                     )
             if seen != token:
                 raise UserError(
-                    f"--cluster: node {name} does not see {directory.path.resolve()}; --out must "
+                    f"--cluster: node {name} cannot read {directory.path.resolve()}; --out must "
                     "be on storage that all nodes share, under the same path"
                 )
     finally:
@@ -223,7 +223,7 @@ def _check_nodes(
 
 
 def _probe(mark: str, imports: list[str]) -> tuple[dict[str, str], str | None, str | None]:
-    """On a node: its versions, what it reads at ``mark``, and what else is wrong."""
+    """On a node: its versions, the content of the file ``mark``, and an error of imports."""
     problem = None
     try:
         import_modules(imports)
@@ -236,18 +236,18 @@ def _probe(mark: str, imports: list[str]) -> tuple[dict[str, str], str | None, s
 def _train_cell(
     path: str, index: int, seeds: list[int], work: Work, cpus: int, imports: list[str]
 ) -> tuple[list[str], dict[str, Any]]:
-    """On a node: train the lanes of a cell that are not done; complaints, and a line of `TASKS`."""
+    """On a node: train the lanes of a cell; return complaints and a line for `TASKS`."""
     began = time.time()
     import_modules(imports)
     directory = RunDirectory.open(path)
     cell = directory.cells[index]
-    # All cells, because side by side they share a program as wide as the longest window.
+    # All cells: under `vmap` the longest window of all cells determines the program.
     jobs = directory.jobs(work.strategy)
     own = [job for job in jobs if job.cell == cell and job.seed in seeds]
     complaints: list[str] = []
     kept = [checkpoint_steps(directory.lanes.checkpoint_directory(cell, seed)) for seed in seeds]
     training = time.time()
-    # What fits is this node's matter, not the driver's.
+    # This node, not the driver, must have the memory.
     at_once = lanes_at_once(own, work.strategy, cpus or len(workers()), usable_memory())
     here = dataclasses.replace(work, workers=cpus or None, at_once=at_once)
     train_here(directory, own, here, complaints)
@@ -273,7 +273,7 @@ def _watch(
     log: "_Log",
     quiet: bool,
 ) -> None:
-    """Wait for the tasks; on Ctrl-C they are told to write their checkpoints."""
+    """Wait for the tasks; at Ctrl-C, tell them to write their checkpoints."""
     cells = len(pending)
     try:
         with _bar(quiet) as bar:
@@ -307,7 +307,7 @@ def _bar(quiet: bool) -> Progress:
 
 
 def _outcome(ray: ModuleType, task: Any, directory: RunDirectory, jobs: Sequence[Job]) -> list[str]:
-    """Complaints of a task that ended; one that died leaves its reason with its lanes."""
+    """The complaints of an ended task; the reason of a failure is stored with its lanes."""
     try:
         complaints, report = ray.get(task)
         with (directory.path / TASKS).open("a", encoding="utf-8") as file:
@@ -323,7 +323,7 @@ def _outcome(ray: ModuleType, task: Any, directory: RunDirectory, jobs: Sequence
 
 
 class _Log:
-    """The log that the tasks write, as it grows: steps done, and rows for the trackers."""
+    """Reads the log that the tasks write: the steps so far, and new rows for the trackers."""
 
     def __init__(self, directory: RunDirectory, logger: Logger | None) -> None:
         self._path = directory.path / LOG
@@ -331,17 +331,17 @@ class _Log:
         self._logger = logger
         self._reached: dict[tuple[Any, ...], int] = {}
         self._offset = 0
-        self._new_rows()  # what is there already the trackers have
+        self._new_rows()  # the trackers have these rows already
 
     def steps(self) -> int:
-        """Steps up to each lane's last evaluation, by now."""
+        """The sum of all lanes' steps, each at its last evaluation."""
         for row in self._new_rows():
             if self._logger is not None:
                 self._logger.log(self._cells[lane_of(row)[:-1]], row["seed"], row)
         return sum(self._reached.values())
 
     def _new_rows(self) -> list[dict[str, Any]]:
-        """The study's rows among the lines that were ended since the last call."""
+        """The new rows of the study's lanes: lines that were completed since the last call."""
         if not self._path.exists():
             return []
         with self._path.open("rb") as file:

@@ -1,11 +1,11 @@
-"""The agents' colours and order in pictures and on pages."""
+"""Colours and order of the agents in figures and on pages."""
 
 from collections.abc import Iterable
 
 from rtd3jax.registries import AGENTS
 
 OTHER_COLOUR = "#56B4E9"
-"""Of an agent that states no colour of its own, or is not registered here."""
+"""Colour of an agent that defines no colour, or is not registered."""
 
 
 def colour_of(algorithm: str, *, on_dark: bool = False) -> str:
@@ -18,6 +18,6 @@ def colour_of(algorithm: str, *, on_dark: bool = False) -> str:
 
 
 def ordered(algorithms: Iterable[str]) -> list[str]:
-    """Distinct trained agents in the order in which they were registered, unknown ones last."""
+    """Distinct trained agents in the order of their registration; unknown agents come last."""
     known = list(AGENTS)
     return sorted(set(algorithms), key=lambda n: (known.index(n) if n in AGENTS else len(known), n))

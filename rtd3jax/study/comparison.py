@@ -1,4 +1,4 @@
-"""Runs beside each other: the cells that they have in common, with intervals."""
+"""Compares runs in their common cells, with bootstrap intervals."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -19,22 +19,22 @@ MEASURES = ("return", "true_return")
 def compare_runs(
     directories: Sequence[RunDirectory], names: Sequence[str], measure: str = "return"
 ) -> pd.DataFrame:
-    """A row for each cell that the first run has in common with another, and each run that has it.
+    """A row for each common cell of the first run and another run, and for each run with this cell.
 
     Args:
         directories: at least two; the first is the baseline.
-        names: of the runs, distinct.
+        names: distinct names of the runs.
         measure: ``return``, or ``true_return`` of the undisturbed state.
 
-    Columns are those of `rtd3jax.study.results.CELL`, ``run``, and the fields of
-    `rtd3jax.study.statistics.Summary` and `rtd3jax.study.statistics.Comparison` with the first run;
-    the first run's own comparison is NaN, with 0 pairs.
+    The columns are those of `rtd3jax.study.results.CELL`, ``run``, and the fields of
+    `rtd3jax.study.statistics.Summary` and `rtd3jax.study.statistics.Comparison` with the first run.
+    For the first run itself, the comparison is NaN, with 0 pairs.
 
     Raises:
-        UserError: for too few runs, a run twice, a run without results, or no cell in common.
+        UserError: for too few runs, a repeated run, a run without results, or no common cell.
     """
     if len(directories) < 2:
-        raise UserError("compare takes two runs at least, the baseline first")
+        raise UserError("compare needs at least two runs, the baseline first")
     places = [directory.path.resolve() for directory in directories]
     for place, directory in enumerate(directories):
         if places[place] in places[:place]:
@@ -58,8 +58,8 @@ def compare_runs(
             for name, of_run in zip(names, values, strict=True)
         )
         raise UserError(
-            f"no finished cell of {names[0]} (environment, disturbance, agent and history length) "
-            f"is in another run: {has}"
+            f"{names[0]} has no finished cell (environment, disturbance, agent and history length) "
+            f"in common with another run: {has}"
         )
     return pd.DataFrame(rows)
 
@@ -67,7 +67,7 @@ def compare_runs(
 def differing_settings(
     directories: Sequence[RunDirectory], names: Sequence[str], table: pd.DataFrame
 ) -> list[str]:
-    """A line for each setting in which runs differ in the cells of ``table``; for people."""
+    """A line of text for each setting in which runs differ in the cells of ``table``."""
     wanted = set(table[list(CELL)].itertuples(index=False, name=None))
     found: dict[str, dict[str, list[str]]] = {}
     for name, directory in zip(names, directories, strict=True):
@@ -89,14 +89,15 @@ def differing_settings(
 def comparison_markdown(
     table: pd.DataFrame, names: Sequence[str], settings: Sequence[str], measure: str = "return"
 ) -> str:
-    """The table of `compare_runs` for people, with what it means; ``settings`` differ."""
+    """The table of `compare_runs` as Markdown, with an explanation and the ``settings``."""
     what = "return" if measure == "return" else "true-state return"
     lines = [
         f"# {what[0].upper()}{what[1:]}s of {len(names)} runs",
         "",
         f"The interquartile mean (IQM) over seeds, the difference of means to {names[0]}, and the "
-        f"probability that a random seed beats one of {names[0]}; each with its 95 % bootstrap "
-        "interval. A difference is paired where both have at least two equal seeds: so many pairs.",
+        f"probability that a random seed is better than one of {names[0]}; each with its 95 % "
+        "bootstrap interval. A difference is paired if both runs have at least two equal seeds; "
+        "pairs is their number.",
         "",
     ]
     lines += [f"- differs: {line}" for line in settings] + [""] * bool(settings)
@@ -131,7 +132,7 @@ def _values(directory: RunDirectory, measure: str) -> dict[tuple, dict[int, floa
     path = directory.path / "episodes.parquet"
     if not path.is_file():
         raise UserError(
-            f"{directory.path} has no results yet: --status tells how far it is, and its sweep "
+            f"{directory.path} has no results yet: --status prints its state, and its sweep "
             "writes them"
         )
     episodes = read_table(path, EPISODES)
@@ -143,7 +144,7 @@ def _values(directory: RunDirectory, measure: str) -> dict[tuple, dict[int, floa
 
 
 def _environments(of_run: Mapping[tuple, Any]) -> str:
-    """What a run consists of, in few words."""
+    """The environments of a run and their agents, in a few words."""
     environments: dict[str, dict[str, None]] = {}
     for env, disturbance, algorithm, length in of_run:
         agent = f"{algorithm} {length}" if length else algorithm

@@ -1,7 +1,7 @@
-"""What a study consists of, as ``config.json`` has it, and how it grows.
+"""The contents of a study, as in ``config.json``, and their extension.
 
-A study is every cell with every seed. It grows by seeds, by cells and by more steps of a cell; what
-would make another lane of one that is there is refused.
+A study consists of all cells with all seeds. Seeds, cells, and more steps of a cell can be added; a
+change that would alter an existing lane is refused.
 """
 
 import dataclasses
@@ -18,18 +18,18 @@ from rtd3jax.training.lanes import Job
 from rtd3jax.training.run import check_seeds
 
 _NAMED = 3
-"""Cells whose names are spelt out in a line for people."""
+"""Number of items that a message lists by name."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Contents:
-    """Cells, each with all of the seeds.
+    """Cells, each with all seeds.
 
     Attributes:
-        cells: those of the beginning first, then those that were added.
-        seeds: likewise.
-        episodes: of the final evaluation.
-        stages: how many cells there were before each time that cells were added.
+        cells: the cells; added cells come last.
+        seeds: the seeds; added seeds come last.
+        episodes: number of episodes in the final evaluation.
+        stages: number of cells before each addition of cells.
     """
 
     cells: tuple[Cell, ...]
@@ -38,7 +38,7 @@ class Contents:
     stages: tuple[int, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
-        """As in config.json."""
+        """The contents as in config.json."""
         found = {
             "cells": [cell.to_dict() for cell in self.cells],
             "seeds": list(self.seeds),
@@ -48,10 +48,10 @@ class Contents:
 
     @classmethod
     def read(cls, config: Path) -> "Contents":
-        """Those of a configuration file.
+        """The contents in a configuration file.
 
         Raises:
-            UserError: when there is none, or it is not a study's.
+            UserError: when there is no such file, or it is not a study's.
         """
         study = read_config(config)["study"]
         try:
@@ -71,12 +71,12 @@ class Contents:
         return cell_jobs(self.cells, self.seeds, strategy, self.stages)
 
     def lacks(self, asked: "Contents") -> bool:
-        """Whether ``asked`` has something that is not here."""
+        """Whether ``asked`` contains something that this study does not."""
         return grown(self, asked) != self
 
 
 class _NotRegistered(UserError):
-    """A study of agents or memories that this process does not know."""
+    """The study has agents or memories that are not registered in this process."""
 
 
 def _check_registered(config: Path, cell: dict[str, Any]) -> None:
@@ -85,7 +85,7 @@ def _check_registered(config: Path, cell: dict[str, Any]) -> None:
         if isinstance(name, str) and name not in known:
             raise _NotRegistered(
                 f"{config}: {field} {name!r} is not known here, only {', '.join(known)}; register "
-                "what is your own before you open the study, or name its module with --import"
+                "it before you open the study, or name its module with --import"
             )
 
 
@@ -93,7 +93,7 @@ def read_config(config: Path) -> dict[str, Any]:
     """The content of a configuration file.
 
     Raises:
-        UserError: when there is none, or it is not a study's.
+        UserError: when there is no such file, or it is not a study's.
     """
     try:
         content = json.loads(config.read_text("utf-8"))
@@ -106,10 +106,10 @@ def read_config(config: Path) -> dict[str, Any]:
 
 
 def grown(there: Contents, asked: Contents) -> Contents:
-    """What is there, and what is asked for besides.
+    """The contents ``there`` with the additions of ``asked``.
 
     Raises:
-        UserError: naming the field, when a lane that is there would become another one.
+        UserError: naming the field, when an existing lane would change.
     """
     if there.episodes != asked.episodes:
         raise UserError(f"final_episodes: {there.episodes} there, {asked.episodes} here")
@@ -123,13 +123,13 @@ def grown(there: Contents, asked: Contents) -> Contents:
 
 
 def longer_cells(there: Contents, now: Contents) -> list[tuple[Cell, Cell]]:
-    """Cells that have more steps now: (as it was, as it is)."""
+    """Pairs (before, after) of cells that have more steps now."""
     pairs = zip(there.cells, now.cells, strict=False)
     return [(before, after) for before, after in pairs if before != after]
 
 
 def what_was_added(there: Contents, now: Contents) -> str:
-    """In words, for one line; empty where nothing was."""
+    """The additions in words, for a message of one line; empty without additions."""
     added = now.cells[len(there.cells) :]
     words = []
     if seeds := now.seeds[len(there.seeds) :]:
@@ -156,7 +156,7 @@ def _key(cell: Cell) -> tuple[Any, ...]:
 
 
 def _larger(there: Cell, asked: Cell) -> Cell:
-    """``asked``, if it is ``there`` with as many steps or more."""
+    """``asked``, if it equals ``there`` with the same steps or more; else UserError."""
     before, after = there.to_dict(), asked.to_dict()
     longer = after["total_steps"] > before["total_steps"]
     for name in before:
@@ -166,19 +166,19 @@ def _larger(there: Cell, asked: Cell) -> Cell:
 
 
 def _odd(there: Contents, added: Sequence[Cell]) -> str:
-    """Fields in which added cells differ from all that were there: a forgotten flag, perhaps."""
+    """Fields in which added cells differ from all earlier cells, perhaps by a forgotten flag."""
     old = [cell.to_dict() for cell in there.cells]
     words: dict[str, None] = {}
     for cell in added:
         for name, value in _own(cell).items():
             if all(other[name] != value for other in old):
                 before = _listed(list(dict.fromkeys(str(other[name]) for other in old)))
-                words[f"{name} {value} where it was {before}"] = None
+                words[f"{name} {value}, before {before}"] = None
     return "".join(f"; {word}" for word in words)
 
 
 def _own(cell: Cell) -> Mapping[str, Any]:
-    """The configuration without what names the cell."""
+    """The configuration without the fields that identify the cell."""
     names = {"replay_capacity", *cell.key}  # its default is total_steps
     return {n: value for n, value in cell.config.to_dict().items() if n not in names}
 

@@ -1,6 +1,6 @@
-"""Tables, pictures and the summary of a study, made from its lanes' files alone.
+"""Writes tables, figures and the summary of a study, only from the files of its lanes.
 
-So they are the same whatever the order in which lanes ended, and can be made again at any time.
+So the result does not depend on the order in which lanes ended, and can be repeated at any time.
 """
 
 import dataclasses
@@ -33,7 +33,7 @@ _FINAL_ARRAYS = ("final_returns", "final_true_returns")
 
 @dataclasses.dataclass(frozen=True)
 class Reference:
-    """Returns of a policy that needs no training: [episodes] each."""
+    """Returns of a policy that needs no training, [episodes] for each measure."""
 
     env: str
     disturbance: str
@@ -45,8 +45,8 @@ class Reference:
 def derive(
     directory: RunDirectory, references: Iterable[Reference], *, pictures: bool = True
 ) -> None:
-    """Write tables, pictures and the summary of the lanes there are."""
-    # Shards that end together: the last to come here sees the lanes of all.
+    """Write tables, figures and the summary of the lanes that have ended."""
+    # If shards end together, the last one that holds the lock reads the lanes of all.
     with deriver(directory.path):
         _derive(directory, references, pictures)
 
@@ -107,20 +107,20 @@ def _read_lane(
         ]
     except (UserError, KeyError, ValueError, TypeError) as error:
         raise UserError(
-            f"{error}: remove {path}, and the same command trains that lane again"
+            f"{error}: remove {path} and repeat the command to train this lane again"
         ) from error
     if failure is not None:
         failures.append({**row, **failure})
 
 
 def _excerpt(directory: RunDirectory) -> dict[str, object]:
-    """What the cells have in common, and whose fields differ, for the summary."""
+    """Common settings of the cells, and the fields that differ, for the summary."""
     dicts = [cell.to_dict() for cell in directory.cells]
     fields = {}
     for name in dicts[0]:
         if len({cell[name] for cell in dicts}) == 1:
             fields[name] = dicts[0][name]
-        elif name not in directory.cells[0].key:  # those stand in the summary's tables
+        elif name not in directory.cells[0].key:  # fields of the key are in the summary's tables
             fields[name] = _whose(name, dicts)
     return {
         "cells": len(directory.cells),
@@ -132,7 +132,7 @@ def _excerpt(directory: RunDirectory) -> dict[str, object]:
 
 
 def _began_from(directory: RunDirectory) -> dict[str, object]:
-    """What lanes went on from, where some did."""
+    """The networks from which lanes started, if any did."""
     paths = (
         directory.lanes.start_path(c, seed) for c in directory.cells for seed in directory.seeds
     )

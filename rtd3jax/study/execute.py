@@ -1,4 +1,4 @@
-"""Lanes of a run directory, trained in this process."""
+"""Trains lanes of a run directory in this process."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -20,16 +20,16 @@ from rtd3jax.training.progress import Progress
 
 @dataclasses.dataclass(frozen=True)
 class Work:
-    """How lanes are trained.
+    """Options of the training of lanes.
 
     Attributes:
         strategy: ``map`` or ``vmap``; see `rtd3jax.training.lanes`.
-        at_once: lanes that fit in memory.
+        at_once: number of lanes that fit in memory.
         interval: between checkpoints, (seconds, steps): None for both chooses it from their cost.
-        quiet: no progress bar, no remarks.
-        page: whether the run's page is written.
-        workers: as many as this at most; all that there are by default.
-        keep: whether a lane's last checkpoint stays when it ends, for more steps later.
+        quiet: whether to omit the progress bar and remarks.
+        page: whether to write the page of the run.
+        workers: maximum number of workers; all workers by default.
+        keep: whether to keep the last checkpoint of a lane that has ended, for more steps later.
     """
 
     strategy: str
@@ -49,16 +49,16 @@ def train_here(
     references: Sequence[Reference] | None = None,
     logger: Logger | None = None,
 ) -> None:
-    """Train the lanes that are not done; ``complaints`` gains a line for each that fails.
+    """Train the lanes that have not ended; add a line to ``complaints`` for each that fails.
 
-    With ``references``, tables and page are written again about once a minute.
+    With ``references``, tables and page are updated about once a minute.
     """
     waiting = waiting_jobs(directory, jobs)
     add_starts(directory, waiting, write=True)
     for job in waiting:
         directory.lanes.error_path(*job.key).unlink(missing_ok=True)
     if work.at_once < len(waiting) and not work.quiet:
-        print(f"memory for {work.at_once:,} lanes at once: the others wait for their turn")
+        print(f"the memory is enough for {work.at_once:,} lanes: the others wait")
     devices = workers()[: work.workers]
     checkpoints = checkpoints_of(directory, work.interval)
     groups = make_groups(waiting, work.strategy, len(devices), work.at_once, checkpoints)
@@ -74,24 +74,24 @@ def train_here(
 
 
 def waiting_jobs(directory: RunDirectory, jobs: Sequence[Job]) -> list[Job]:
-    """Those that are not done; says so where some are."""
+    """The lanes that have not ended; prints the number of those that have."""
     waiting = [job for job in jobs if not directory.lanes.is_done(*job.key)]
     if len(waiting) < len(jobs):
-        print(f"{len(jobs) - len(waiting)} of {len(jobs)} lanes are there already")
+        print(f"{len(jobs) - len(waiting)} of {len(jobs)} lanes have ended already")
     return waiting
 
 
 def checkpoints_of(
     directory: RunDirectory, interval: tuple[float | None, int | None]
 ) -> Checkpoints:
-    """Where the lanes of a run keep their checkpoints, and as what."""
+    """The checkpoints of a run: the directory and the identity of each lane."""
 
     def identity(job: Job) -> dict[str, Any]:
         cell, seed = job.key
         found = {**cell.to_dict(), "seed": seed, "window": job.program.window_tokens}
-        # A recording is named by its disturbance alone, and its file may have changed since.
+        # The name of a disturbance does not identify a recording: its file may have changed.
         large = [leaf for leaf in jax.tree.leaves(job.lane.env_params) if leaf.size > MOST_NUMBERS]
-        # First, so that a refusal names it where it is not the only difference.
+        # First, so that an error message names it, even if there are other differences.
         return {"recorded": [named_numbers(leaf) for leaf in large], **found} if large else found
 
     return Checkpoints(

@@ -1,7 +1,7 @@
 """Figures of a study: learning curves and final returns, each as PNG and SVG.
 
-Built on matplotlib's object API without pyplot, so that drawing needs no display and shares no
-current figure with the caller. Equal data give equal SVG bytes.
+This module uses matplotlib's object API without pyplot, so it needs no display and does not change
+the caller's current figure. Equal data give equal SVG bytes.
 """
 
 import io
@@ -32,10 +32,10 @@ REFERENCE_DASHES: dict[str, Any] = {
     "upper bound": (0, (1, 1)),
 }
 OTHER_DASHES = ((0, (7, 3, 2, 3)), (0, (4, 2)), (0, (7, 2, 2, 2, 2, 2)))
-"""Of an environment's own baselines; a name has the same ones in every figure."""
+"""Line styles of baselines; a baseline has the same style in every figure."""
 MARKERS = "osD^vPX"
 
-# Share of the lower edges of the bands that may fall below a learning-curve panel.
+# Fraction of the lower edges of the bands that may lie below a panel of learning curves.
 CLIPPED_SHARE = 0.25
 
 _STYLE: Any = {
@@ -46,7 +46,7 @@ _STYLE: Any = {
 
 
 Ceilings = Mapping[tuple[str, str], Mapping[str, Any]]
-"""Of an (env, disturbance): ``mean`` and ``kind``; see `rtd3jax.study.ceilings`."""
+"""``mean`` and ``kind`` by (env, disturbance); see `rtd3jax.study.ceilings`."""
 
 
 def learning_curves(
@@ -57,18 +57,18 @@ def learning_curves(
 ) -> list[Path]:
     """Draw return against environment steps; return the paths of the PNG and the SVG.
 
-    ``curves`` has the columns of CURVES; ``references`` those of EPISODES, of which only the
-    reference policies are used; ``ceilings`` are drawn where they are known. One panel per
-    disturbance (rows) and history length (columns); a line is the interquartile mean (IQM) over the
-    seeds with a finite value at that step, its band the 95% bootstrap interval of it.
+    ``curves`` has the columns of CURVES, and ``references`` those of EPISODES, from which only the
+    rows of reference policies are used. Known ``ceilings`` are drawn too. There is a panel for each
+    disturbance (row) and history length (column). A line is the interquartile mean (IQM) over the
+    seeds with a finite value at this step, and its band is the 95% bootstrap interval.
 
     The panels of a row share their y-limits: from the lower quartile of all lower band edges
-    (or the lowest final IQM, if lower, so that no line ends outside) to the highest upper edge.
-    Very bad returns early in training thus leave the panel instead of squashing the rest.
+    (or the lowest final IQM, if lower, so that no line ends outside) to the highest upper edge. So
+    very low returns early in training are outside the panel, and do not compress the other curves.
     """
     with mpl.rc_context(_STYLE):
         tasks = _tasks(curves)
-        # Agents without a window (length 0) are shown beside every length.
+        # Agents without a window (length 0) are shown in the panels of all lengths.
         lengths = sorted({int(length) for length in curves["history_length"]} - {0})
         figure, grid = _panels(len(tasks), max(len(lengths), 1), width=3.6, height=2.7)
         if not tasks:
@@ -93,10 +93,11 @@ def final_returns(
 ) -> list[Path]:
     """Draw the final evaluation; return the paths of the PNG and the SVG.
 
-    ``episodes`` has the columns of EPISODES. One panel per disturbance with the algorithms along
-    x; faint dots are the mean returns of single seeds, the marker is their interquartile mean and
-    the bar its 95 % bootstrap interval (none for a single seed). Marker shapes tell the history
-    lengths apart; horizontal lines are the reference policies, and ``ceilings`` that are known.
+    ``episodes`` has the columns of EPISODES. There is a panel for each disturbance, with the
+    algorithms along x. Light dots are the mean returns of single seeds, the marker is their
+    interquartile mean, and the bar is its 95 % bootstrap interval (none for a single seed). The
+    shape of the marker shows the history length; horizontal lines are the reference policies and
+    known ``ceilings``.
     """
     with mpl.rc_context(_STYLE):
         lanes = seed_means(episodes)
@@ -165,9 +166,9 @@ def _curve_row(
 
 
 def _band(line: pd.DataFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Steps, IQM over seeds and the bounds of its interval [evaluations], as on a run's page.
+    """Steps, IQM over seeds, and the bounds of its interval, [evaluations] each.
 
-    Steps without values are left out. The bounds of a single seed are its line.
+    Steps without values are left out. For a single seed, the bounds equal its value.
     """
     table = line.pivot(index="seed", columns="step", values="return")
     count, iqm, low, high = iqm_bands(table.to_numpy(np.float64))
@@ -184,7 +185,7 @@ def _final_panel(
     for position, name in enumerate(algorithms):
         of_algorithm = lanes[lanes["algorithm"] == name]
         present = sorted({int(length) for length in of_algorithm["history_length"]})
-        # Spread evenly about the tick, by the lengths this algorithm has, so td3 is centred.
+        # Evenly spaced around the tick over the lengths of this algorithm, so td3 is centred.
         gap = 0.7 / max(len(lengths), 3)
         for index, length in enumerate(present):
             values = of_algorithm.loc[of_algorithm["history_length"] == length, "return"]
@@ -193,7 +194,7 @@ def _final_panel(
                 continue
             x = position + gap * (index - (len(present) - 1) / 2)
             finite = values[np.isfinite(values)]
-            # Beside the marker, not under it: the dots would hide behind the bar.
+            # Next to the marker: under it, the bar would hide the dots.
             axes.scatter(
                 np.full(len(finite), x - 0.32 * gap),
                 finite,
@@ -228,8 +229,8 @@ def _final_panel(
 def _fit(axes: Axes, values: Iterable[float], references: dict[str, float]) -> None:
     """Set y-limits around ``values`` and draw the reference lines.
 
-    A reference farther away than the range of the values is named at the edge instead, since
-    showing its line would squash everything else.
+    A reference whose distance exceeds the range of the values is named at the edge instead, because
+    its line would compress all values.
     """
     values = np.asarray(list(values), dtype=np.float64)
     values = values[np.isfinite(values)]
@@ -256,7 +257,7 @@ def _fit(axes: Axes, values: Iterable[float], references: dict[str, float]) -> N
             far[edge].append(f"{arrow} {name}: {mean:.4g}")
     for edge, texts in far.items():
         if texts:
-            # Free space for the words, so that no curve runs through them.
+            # Free space for the text, so that no curve crosses it.
             room = 0.12 * (high - low + 2 * margin)
             low, high = (low - room, high) if edge == "bottom" else (low, high + room)
             axes.text(
@@ -277,7 +278,7 @@ def _fit(axes: Axes, values: Iterable[float], references: dict[str, float]) -> N
 def _reference_means(
     episodes: pd.DataFrame | None, ceilings: Ceilings | None, task: tuple[str, str]
 ) -> dict[str, float]:
-    """Mean return over all finite episodes of each reference policy, and the ceiling's."""
+    """Mean return of each reference policy over all finite episodes, and the ceiling."""
     means = {}
     if episodes is not None:
         rows = _of_task(episodes, task)
@@ -294,7 +295,7 @@ def _reference_means(
 
 
 def _reference_handles(means: Iterable[dict[str, float]]) -> list[Line2D]:
-    """Legend entries of the names that any panel has."""
+    """Legend entries of the references in all panels."""
     present = {name for of_task in means for name in of_task}
     return [
         Line2D(
@@ -310,7 +311,7 @@ def _reference_handles(means: Iterable[dict[str, float]]) -> list[Line2D]:
 
 
 def _dashes(name: str) -> Any:
-    """The line style of a reference or a bound."""
+    """The line style of a reference or a ceiling."""
     other = OTHER_DASHES[sum(name.encode()) % len(OTHER_DASHES)]
     return REFERENCE_DASHES.get(name, other)
 
@@ -318,13 +319,13 @@ def _dashes(name: str) -> Any:
 def _panels(rows: int, columns: int, width: float, height: float) -> tuple[Figure, np.ndarray]:
     """A figure with [rows, columns] panels of ``width`` by ``height`` inches each."""
     rows = max(rows, 1)
-    # A floor on the width leaves a lone panel room for its legend.
+    # With a minimum width, a single panel has space for its legend.
     figure = Figure(figsize=(max(width * columns, 5.2), height * rows + 0.7), layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
 def _legend(figure: Figure, handles: list[Line2D]) -> None:
-    """One legend below all panels, where it cannot cover data."""
+    """Draw a legend below all panels, where it covers no data."""
     if handles:
         # About 1.6 inches per entry.
         columns = max(1, min(len(handles), int(figure.get_figwidth() / 1.6)))
@@ -350,7 +351,7 @@ def _save(figure: Figure, directory: str | Path, stem: str) -> list[Path]:
 
 
 def _tasks(table: pd.DataFrame) -> list[tuple[str, str]]:
-    """The (env, disturbance) pairs of ``table``, sorted with the undisturbed ones first."""
+    """The sorted (env, disturbance) pairs of ``table``; those without a disturbance come first."""
     pairs = set(zip(table["env"], table["disturbance"], strict=True))
     return sorted(pairs, key=lambda pair: (pair[0], pair[1] != "none", pair[1]))
 
@@ -360,7 +361,7 @@ def _of_task(table: pd.DataFrame, task: tuple[str, str]) -> pd.DataFrame:
 
 
 def _title(tasks: list[tuple[str, str]], task: tuple[str, str]) -> str:
-    """The disturbance, with its environment only where the study has several."""
+    """The disturbance, with its environment if the study has several environments."""
     name = "no disturbance" if task[1] == "none" else task[1]
     return name if len({env for env, _ in tasks}) == 1 else f"{task[0]}: {name}"
 

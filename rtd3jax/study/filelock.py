@@ -1,7 +1,7 @@
-"""The operating system's locks of files: flock where there is one, Windows's byte ranges else.
+"""File locks of the operating system: flock, or byte ranges on Windows.
 
-A lock goes when its process goes, however that ends. On a file system without locks (Lustre without
-flock, NFS without a lock daemon) it is held by nobody, and one warning says so.
+A lock is released when its process ends for any reason. On a file system without locks (Lustre
+without flock, NFS without a lock daemon), nothing is locked, and a single warning says so.
 """
 
 import errno
@@ -23,14 +23,14 @@ except ImportError:
 msvcrt: Any = _msvcrt
 NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
 _SHARERS = 1024
-"""On Windows, bytes of which each holder of a shared lock locks one, and an exclusive one all."""
+"""On Windows, number of bytes: a shared lock locks one of them, an exclusive lock all."""
 
 
 def lock(handle: int, *, shared: bool = False, wait: bool = False) -> None:
     """Lock an open file until it is closed.
 
     Raises:
-        BlockingIOError: when another process holds it and ``wait`` is false.
+        BlockingIOError: when another process holds the lock and ``wait`` is false.
     """
     try:
         if fcntl is not None:
@@ -51,13 +51,13 @@ def lock(handle: int, *, shared: bool = False, wait: bool = False) -> None:
 
 
 def open_for_locking(path: Path, *, create: bool = True) -> int:
-    """A handle of the file, which is never a link; `os.close` lets its locks go."""
+    """Open the file, which must not be a link; `os.close` releases its locks."""
     flags = os.O_RDWR | os.O_CREAT if create else os.O_RDONLY
     return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
 
 
 def _lock_bytes(handle: int, shared: bool, wait: bool) -> None:
-    """As `lock`, by Windows's exclusive locks of byte ranges."""
+    """As `lock`, with exclusive locks of byte ranges on Windows."""
     while True:
         for start in range(_SHARERS) if shared else (0,):
             os.lseek(handle, start, os.SEEK_SET)

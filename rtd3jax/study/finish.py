@@ -1,4 +1,4 @@
-"""What is written when training has ended: ceilings, tables, pictures and the page."""
+"""Writes the results when training has ended: ceilings, tables, figures and the page."""
 
 from collections.abc import Sequence
 
@@ -15,15 +15,15 @@ def finish(
     page: bool,
     interrupted: bool = False,
 ) -> None:
-    """Write what is made from the lanes there are.
+    """Write the results of the lanes that have ended.
 
     Args:
-        directory: the run.
+        directory: the run directory.
         references: policies that need no training.
         page: whether to write the page, and the ceilings that it shows.
-        interrupted: whether training was ended before its time.
+        interrupted: whether the training was interrupted.
     """
-    # Of several processes the last to end has the rest to do.
+    # Of several processes, only the last one writes ceilings and the complete page.
     complete = page and directory.has_ended() and not interrupted
     if complete:
         compute_ceilings(directory.path, directory.cells)

@@ -1,4 +1,4 @@
-"""Tables, pictures and the page of a run that is still under way."""
+"""Interim results: tables, figures and the page of a run during training."""
 
 import time
 from collections.abc import Sequence
@@ -8,11 +8,11 @@ from rtd3jax.study.report.page import refresh_page
 from rtd3jax.study.rundir import RunDirectory
 
 SECONDS = 60.0
-"""Between two writings of the tables and the page, at least."""
+"""Minimum time in seconds between two updates of the tables and the page."""
 
 
 class InterimResults:
-    """Writes tables, pictures and page again while lanes are still trained."""
+    """Updates tables, figures and the page during training."""
 
     def __init__(self, directory: RunDirectory, references: Sequence[Reference], *, page: bool):
         self._directory = directory
@@ -21,7 +21,7 @@ class InterimResults:
         self._made = time.perf_counter()
 
     def refresh(self) -> None:
-        """Write them, unless they were written less than `SECONDS` ago."""
+        """Update the results, unless this was done less than `SECONDS` ago."""
         if time.perf_counter() - self._made > SECONDS:
             derive(self._directory, self._references)
             if self._page:

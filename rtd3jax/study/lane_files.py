@@ -1,7 +1,8 @@
-"""The files of a study's lanes: what each was trained to, where it can go on, why it could not.
+"""The files of a study's lanes: results, checkpoints and errors.
 
 ``lanes/<cell>/seed-<n>.safetensors`` holds a lane's trained policy, its learning curve and its
-final episodes. All else in a run directory follows from them, but its configuration and its log.
+final episodes. All other files of a run directory, except its configuration and its log, are
+derived from these files.
 """
 
 import re
@@ -19,7 +20,7 @@ from rtd3jax.system.files import read_arrays, read_metadata, write_arrays, write
 
 
 class LaneFiles:
-    """The files below a run directory that belong to one lane each.
+    """The files of lanes in a run directory.
 
     Args:
         path: the run directory.
@@ -29,30 +30,30 @@ class LaneFiles:
         self.path = path
 
     def lane_path(self, cell: Cell, seed: int) -> Path:
-        """Where a lane's file is."""
+        """The path of a lane's file."""
         return self._within("lanes", cell_name(cell), f"seed-{seed}.safetensors")
 
     def checkpoint_directory(self, cell: Cell, seed: int) -> Path:
-        """Where a lane that is under way keeps its checkpoints."""
+        """The directory of a lane's checkpoints."""
         return self._within("checkpoints", cell_name(cell), f"seed-{seed}")
 
     def playback_path(self, cell: Cell, seed: int) -> Path:
-        """Where the page keeps the episodes that a lane's policy played for it."""
+        """The file with the episodes of a lane's policy for the page."""
         return self._within("playback", cell_name(cell), f"seed-{seed}.json")
 
     def _within(self, *parts: str) -> Path:
-        """A path inside the directory, also where links lead elsewhere."""
+        """A path inside the directory; UserError if a link leads outside."""
         path = self.path.joinpath(*parts)
         if not path.resolve().is_relative_to(self.path.resolve()):
             raise UserError(f"{path} leads outside {self.path}; remove the link")
         return path
 
     def error_path(self, cell: Cell, seed: int) -> Path:
-        """Where the reason stands for which a lane could not be trained."""
+        """The file with the reason why a lane could not be trained."""
         return self.lane_path(cell, seed).with_suffix(".error.txt")
 
     def is_done(self, cell: Cell, seed: int) -> bool:
-        """Whether the lane was trained to its end, be it lost; with more steps later, to that."""
+        """Whether the lane was trained to its current number of steps, or was lost."""
         path = self.lane_path(cell, seed)
         if not path.exists():
             return False
@@ -62,10 +63,10 @@ class LaneFiles:
                 cell, seed
             )
         except (UserError, KeyError, TypeError):
-            return True  # whoever reads it says what is wrong with it
+            return True  # reading the file will report the error
 
     def is_lost(self, cell: Cell, seed: int) -> bool:
-        """Whether the lane, which has a file, was lost in training."""
+        """Whether a lane with a file was lost in training."""
         return read_metadata(self.lane_path(cell, seed))["failure"] is not None
 
     def write_lane(
@@ -78,17 +79,17 @@ class LaneFiles:
         failure: dict[str, Any] | None,
         interface: dict[str, Any] | None = None,
     ) -> None:
-        """Keep a lane that ended.
+        """Write the file of a lane that has ended.
 
         Args:
-            cell: its cell.
-            seed: its seed.
-            parameters: of its policy, as `Policy.parameters` names them.
+            cell: the cell of the lane.
+            seed: the seed of the lane.
+            parameters: the arrays of `Policy.parameters`.
             curves: ``steps``, ``returns``, ``true_returns`` [K] and ``final_returns``,
                 ``final_true_returns`` [episodes].
-            metrics: of learning, [K] by name.
+            metrics: metrics of learning, [K] by name.
             failure: step and reason, if the lane was lost.
-            interface: what `Policy.interface` says of its policy, which then can be loaded where
+            interface: the result of `Policy.interface`, with which the policy can be loaded even if
                 the cell's environment is not registered.
         """
         arrays = dict(parameters)
@@ -108,16 +109,14 @@ class LaneFiles:
         """
         lane = f"{cell_name(cell)} seed {seed}"
         if not self.is_done(cell, seed):
-            raise UserError(
-                f"{lane} is not trained yet in {self.path}; --status tells how far it is"
-            )
+            raise UserError(f"{lane} is not trained yet in {self.path}; --status prints its state")
         path = self.lane_path(cell, seed)
         arrays, metadata = read_arrays(path)
         if metadata["failure"] is not None:
             raise UserError(f"{lane} was lost in training: {metadata['failure']['reason']}")
         if isinstance(metadata.get("interface"), dict):
             interface = read_interface(path, metadata["interface"])
-        else:  # of a version that did not write it
+        else:  # an earlier version wrote the file without it
             env = cell.make_env()
             interface = describe(env, env.default_params)
         return restore_policy(
@@ -134,20 +133,20 @@ class LaneFiles:
         )
 
     def start_path(self, cell: Cell, seed: int) -> Path:
-        """Where it stands what a lane began from, if it did not begin with new weights."""
+        """The file that names the networks from which a lane started."""
         return self.lane_path(cell, seed).with_suffix(".start.txt")
 
     def write_start(self, cell: Cell, seed: int, what: str) -> None:
-        """Keep what a lane begins from."""
+        """Write the name of the networks from which a lane starts."""
         write_bytes_atomically(self.start_path(cell, seed), (what + "\n").encode())
 
     def write_error(self, cell: Cell, seed: int, reason: str) -> None:
-        """Keep the reason for which a lane could not be trained."""
+        """Write the reason why a lane could not be trained."""
         write_bytes_atomically(self.error_path(cell, seed), (reason + "\n").encode())
 
 
 def cell_name(cell: Cell) -> str:
-    """A directory name that tells cells apart."""
-    disturbance = cell.disturbance.replace("/", "~")  # alternatives, told from other characters
+    """The unique directory name of a cell."""
+    disturbance = cell.disturbance.replace("/", "~")  # "~" stands for "/", "-" for any other character
     text = f"{cell.env}_{disturbance}_{cell.config.algorithm}_l{cell.config.history_length}"
     return re.sub(r"[^A-Za-z0-9._=+~-]", "-", text)

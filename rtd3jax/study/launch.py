@@ -1,8 +1,8 @@
 """Joins a job of several processes, then runs a command: ``python launch.py MODULE ARGUMENTS``.
 
-A process may join only before JAX has touched a device, and importing gymnax touches one; so this
-file is run by its path, in a process of its own, and imports the package last.
-`rtd3jax.study.hosts` starts it.
+A process can only join a job before JAX uses a device, and the import of gymnax uses one. So this
+file is run by its path, in its own process, and imports the package last. `rtd3jax.study.hosts`
+starts it.
 """
 
 import importlib
@@ -12,16 +12,16 @@ import sys
 import jax
 
 FOREVER = 10 * 365 * 24 * 3600
-"""Seconds for which a process that is done waits for the others before it leaves the job."""
+"""Seconds for which a process that has ended waits for the others before it leaves the job."""
 
 
 def number(name: str) -> int | None:
-    """An environment variable as a number, if it is there."""
+    """An environment variable as a number; None if it is not set."""
     return int(os.environ[name]) if os.environ.get(name) else None
 
 
 def main() -> int:
-    """Join, run the module's ``main``, leave; its exit status."""
+    """Join the job, run the module's ``main``, and return its exit status."""
     try:
         jax.distributed.initialize(
             num_processes=number("JAX_NUM_PROCESSES"),

@@ -1,6 +1,6 @@
-"""One writer for a run directory, or one for each shard of it; one at a time for its tables.
+"""Locks of a run directory: one writer in total or per shard, and one writer of its tables.
 
-The lock is the operating system's: it goes when its process goes, however that ends.
+The operating system releases a lock when its process ends for any reason.
 """
 
 import contextlib
@@ -16,7 +16,7 @@ from rtd3jax.study.filelock import lock, open_for_locking
 
 
 def parse_shard(text: str) -> tuple[int, int]:
-    """``"2/4"`` as (2, 4): the second of four shares."""
+    """Parse ``"2/4"`` as (2, 4), the second of four shares."""
     match = re.fullmatch(r"\s*(\d{1,6})\s*/\s*(\d{1,6})\s*", text)
     if match is None or not 1 <= int(match[1]) <= int(match[2]):
         raise UserError(f"--shard {text!r} is not of the form i/n with 1 <= i <= n")
@@ -25,10 +25,10 @@ def parse_shard(text: str) -> tuple[int, int]:
 
 @contextlib.contextmanager
 def writer(directory: Path, shard: tuple[int, int] | None) -> Iterator[None]:
-    """Hold the directory: alone, or beside writers of other shards.
+    """Hold the lock of the directory, or of one of its shards.
 
     Raises:
-        UserError: when another process holds it, or the same shard of it.
+        UserError: when another process holds the same lock.
     """
     with contextlib.ExitStack() as stack:
         whole = "another process is writing to it"
@@ -44,7 +44,7 @@ def writer(directory: Path, shard: tuple[int, int] | None) -> Iterator[None]:
 
 @contextlib.contextmanager
 def deriver(directory: Path) -> Iterator[None]:
-    """Wait for, and hold, the right to write the tables that all shards have in common."""
+    """Wait for the lock of the tables, which all shards share, and hold it."""
     with contextlib.ExitStack() as stack:
         handle = _open(directory, directory / ".lock-tables")
         stack.callback(os.close, handle)
@@ -60,7 +60,7 @@ def is_held(directory: Path) -> bool:
         return False
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # where there are no locks, none is held
+            warnings.simplefilter("ignore")  # of a file system without locks
             lock(handle)
     except BlockingIOError:
         return True
@@ -75,7 +75,7 @@ def _hold(
 ) -> None:
     handle = _open(directory, path)
     stack.callback(os.close, handle)
-    for patience in (0.1, 0.2, None):  # --status looks at a lock by holding it for a moment
+    for patience in (0.1, 0.2, None):  # --status holds a lock for a moment to test it
         try:
             lock(handle, shared=shared)
             return

@@ -1,4 +1,4 @@
-"""A study's log: a row of JSON for each evaluation of each lane, while they are trained."""
+"""The log of a study: a JSON row for each evaluation of each lane, written during training."""
 
 import json
 from collections.abc import Iterable
@@ -11,7 +11,7 @@ LOG = "log.jsonl"
 
 
 def repair_log(path: Path) -> set[tuple[Any, ...]]:
-    """End a line that was cut short; the lanes and steps that the log has."""
+    """Complete a truncated last line; return the lanes and steps in the log."""
     if path.exists() and not path.read_bytes().endswith(b"\n"):
         with path.open("a", encoding="utf-8") as file:
             file.write("\n")
@@ -19,7 +19,7 @@ def repair_log(path: Path) -> set[tuple[Any, ...]]:
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:
-    """Rows of a log; a line that a killed process left half-written is passed over."""
+    """Rows of a log, without the incomplete line of a killed process."""
     return parse_log(path.read_text("utf-8")) if path.exists() else []
 
 
@@ -37,7 +37,7 @@ def parse_log(text: str) -> list[dict[str, Any]]:
 
 
 def lane_of(row: dict[str, Any]) -> tuple[Any, ...]:
-    """The lane that a row is of: its cell's key and its seed."""
+    """The lane of a row: the key of its cell and its seed."""
     return tuple(row[name] for name in (*CELL, "seed"))
 
 

@@ -1,11 +1,11 @@
-"""Learning curves in the trackers that people already use, fed between chunks.
+"""Sends learning curves to experiment trackers, between chunks.
 
-A lane is a run of the tracker, named as in the run directory; its metrics against environment steps
-are ``evaluation/return`` and those of learning, such as ``learning/critic_loss``. A lane that goes
-on from a checkpoint goes on in its run. Where a tracker keeps its files or sends them is for its
-own environment variables to say (``WANDB_MODE``, ``MLFLOW_TRACKING_URI``); by default all of it
-stays in the run directory. A tracker that cannot be opened is refused before training; one that
-fails later is let go with a warning, and the lanes go on.
+A lane is a run of the tracker, with the name that it has in the run directory. The metrics over
+environment steps are ``evaluation/return`` and metrics of learning, such as
+``learning/critic_loss``. A lane that continues from a checkpoint continues its run. Environment
+variables of the tracker (``WANDB_MODE``, ``MLFLOW_TRACKING_URI``) define where its data go; by
+default they stay in the run directory. If a tracker cannot be opened, an error is raised before
+training. If it fails later, it is removed with a warning, and training continues.
 """
 
 import abc
@@ -26,32 +26,32 @@ from rtd3jax.study.rundir import RunDirectory
 
 METRIC = "evaluation/return"
 LEARNING = "learning/"
-"""How the names of the metrics of learning begin."""
+"""Prefix of the names of the metrics of learning."""
 
 
 class Logger(Protocol):
-    """What takes the rows of the log as they are written."""
+    """Receives the rows of the log when they are written."""
 
     def log(self, cell: Cell, seed: int, row: dict[str, Any]) -> None:
-        """Take ``row``: ``step``, ``return`` and ``metrics`` (None for what is not finite)."""
+        """Send ``row``: ``step``, ``return`` and ``metrics`` (None for infinity and NaN)."""
 
     def close(self) -> None:
-        """Write what is not written yet."""
+        """Write all remaining data."""
 
 
 Run = TypeVar("Run")
-"""What a tracker knows a lane by."""
+"""The tracker's object or id of a lane."""
 
 
 class PerLane(abc.ABC, Generic[Run]):
-    """A logger that has a run of its tracker for each lane, begun with the lane's first row."""
+    """A logger with a run of the tracker for each lane, which begins at the lane's first row."""
 
     def __init__(self, directory: RunDirectory) -> None:
         self._path = directory.path
         self._runs: dict[tuple[str, int], Run] = {}
 
     def log(self, cell: Cell, seed: int, row: dict[str, Any]) -> None:
-        """A point of the lane's curve."""
+        """Send a point of the lane's curves."""
         lane = cell_name(cell), seed
         if lane not in self._runs:
             self._runs[lane] = self._begin(cell, seed)
@@ -62,18 +62,18 @@ class PerLane(abc.ABC, Generic[Run]):
             self._points(self._runs[lane], finite, row["step"])
 
     def close(self) -> None:
-        """End the runs, each also when others cannot be ended."""
+        """End all runs, even if the end of some fails."""
         with contextlib.ExitStack() as stack:
             for run in self._runs.values():
                 stack.callback(self._end, run)
 
     @abc.abstractmethod
     def _begin(self, cell: Cell, seed: int) -> Run:
-        """The lane's run."""
+        """Begin or continue the run of a lane."""
 
     @abc.abstractmethod
     def _points(self, run: Run, values: dict[str, float], step: int) -> None:
-        """Write the values of some metrics."""
+        """Write values of metrics at a step."""
 
     @abc.abstractmethod
     def _end(self, run: Run) -> None:
@@ -84,23 +84,23 @@ class EventWriter(Protocol):
     """tensorboardX's ``SummaryWriter``."""
 
     def add_scalar(self, tag: str, value: float, step: int, /) -> object:
-        """A point of a curve."""
+        """Write a point of a curve."""
 
     def flush(self) -> None:
-        """Write what waits."""
+        """Write all waiting points."""
 
     def close(self) -> None:
-        """Write what waits, and end."""
+        """Write all waiting points, and close the files."""
 
 
 class WandBRun(Protocol):
     """A run as ``wandb.init`` returns it."""
 
     def log(self, row: dict[str, float], /) -> object:
-        """Points of curves."""
+        """Write points of curves."""
 
     def finish(self) -> object:
-        """End."""
+        """End the run."""
 
 
 class TensorBoard(PerLane[EventWriter]):
@@ -112,13 +112,13 @@ class TensorBoard(PerLane[EventWriter]):
 
     def _begin(self, cell: Cell, seed: int) -> EventWriter:
         path = self._path / "tensorboard" / cell_name(cell) / f"seed-{seed}"
-        # Its queue blocks for ever where the thread that writes has died; a row never fills this.
+        # With a shorter queue, a dead writer thread would block this one; a row never fills this.
         return self._make(str(path), max_queue=1000)
 
     def _points(self, run: EventWriter, values: dict[str, float], step: int) -> None:
         for name, value in values.items():
             run.add_scalar(name, value, step)
-        run.flush()  # what cannot be written is an error here, not only in the tracker's thread
+        run.flush()  # raises an error of writing here, not only in the tracker's thread
 
     def _end(self, run: EventWriter) -> None:
         run.close()
@@ -132,7 +132,7 @@ class WandB(PerLane[WandBRun]):
         self._wandb = importlib.import_module("wandb")
         self._mode = os.environ.get("WANDB_MODE", "offline")
         if self._mode == "online" and not self._wandb.api.api_key:
-            raise UserError("WANDB_MODE is online and there is no key; run wandb login")
+            raise UserError("WANDB_MODE is online, but there is no key; run wandb login")
 
     def _begin(self, cell: Cell, seed: int) -> WandBRun:
         name = cell_name(cell)
@@ -194,11 +194,11 @@ LOGGERS: dict[str, tuple[str, Callable[[RunDirectory], Logger]]] = {
     "wandb": ("wandb", WandB),
     "mlflow": ("mlflow", MLflow),
 }
-"""What ``--log`` knows: the package that it needs, and the logger."""
+"""The trackers of ``--log``: the package of each, and the logger."""
 
 
 class _Several:
-    """Loggers as one; the first exception of any of them is a warning, and it gets no more rows."""
+    """Several loggers as one. A logger that fails is removed with a warning."""
 
     def __init__(self, loggers: dict[str, Logger]) -> None:
         self._loggers = loggers
@@ -210,7 +210,7 @@ class _Several:
             except Exception as error:
                 del self._loggers[name]
                 self._warn(name, error)
-                with contextlib.suppress(Exception):  # what it has may still be written
+                with contextlib.suppress(Exception):  # its earlier rows may still be written
                     logger.close()
 
     def close(self) -> None:
@@ -223,17 +223,17 @@ class _Several:
     @staticmethod
     def _warn(name: str, error: Exception) -> None:
         print(
-            f"warning: --log {name} failed and is left out from here on; training goes on: "
+            f"warning: --log {name} failed and gets no more rows; training continues: "
             f"{first_line(error)}",
             file=sys.stderr,
         )
 
 
 def check_loggers(names: Sequence[str]) -> None:
-    """Refuse what is not installed.
+    """Check that the trackers are installed.
 
     Raises:
-        UserError: naming the extra that brings it.
+        UserError: naming the extra that installs a missing tracker.
     """
     for name in names:
         package, _ = LOGGERS[name]
@@ -243,7 +243,7 @@ def check_loggers(names: Sequence[str]) -> None:
 
 @contextlib.contextmanager
 def open_loggers(names: Sequence[str], directory: RunDirectory) -> Iterator[Logger | None]:
-    """The loggers of these names as one, closed at the end; None without names.
+    """The loggers of these names as one, which is closed at the end; None without names.
 
     Raises:
         UserError: when one of them cannot be opened.
@@ -265,6 +265,6 @@ def open_loggers(names: Sequence[str], directory: RunDirectory) -> Iterator[Logg
 
 
 def _lane_id(path: Path, cell: str, seed: int) -> str:
-    """The same for a lane each time that its run directory goes on, and no one else's."""
+    """The unique id of a lane, the same after each restart of its study."""
     text = f"{path.resolve()}\n{cell}\n{seed}"
     return hashlib.sha256(text.encode()).hexdigest()[:24]

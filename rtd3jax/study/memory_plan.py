@@ -1,4 +1,4 @@
-"""What lanes need in memory, before anything is allocated, and how many fit at once."""
+"""Estimates the memory of lanes before allocation, and how many lanes fit together."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,24 +13,24 @@ from rtd3jax.system.machine import memory_limit
 from rtd3jax.training.lanes import Job, workers
 
 _GRADIENTS = 1.3
-"""Copies of all parameters that are alive beside them."""
+"""Number of temporary copies of all parameters."""
 
 _ACTING = 8
-"""Arrays of [l + 1, E, H] that are alive while E episodes are evaluated side by side."""
+"""Number of temporary arrays of [l + 1, E, H] in an evaluation of E episodes."""
 
 _PRESENT_STEPS = 22
-"""Arrays of [B, H] alive beside a segment's: one step of the memory for each transition."""
+"""Number of temporary arrays of [B, H] for the step of the memory at each transition."""
 
 _HEADROOM = 0.8
-"""Share of the memory that lanes may take: programs, tables and the rest need some too."""
+"""Fraction of the memory for lanes; the rest is for programs and tables."""
 
 
 PROCESS_BYTES = 1_150 * 2**20
-"""Of a process before it has a lane: Python, JAX, its compiled programs, tables and pictures."""
+"""Bytes of a process without lanes: Python, JAX, compiled programs, tables and figures."""
 
 
 def state_bytes(job: Job) -> int:
-    """Bytes that a lane keeps: parameters, optimisers, replay, carries, environment; exact."""
+    """Exact bytes of a lane's state: parameters, optimisers, replay, carries, environment."""
 
     def size(leaf: jax.Array | jax.ShapeDtypeStruct) -> int:
         key = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
@@ -40,7 +40,7 @@ def state_bytes(job: Job) -> int:
 
 
 def working_bytes(config: Config, observation_size: int, action_size: int) -> int:
-    """Bytes that a lane needs beside its state while it advances: activations and gradients."""
+    """Temporary bytes of a lane that advances: activations and gradients."""
     row = 4 * config.hidden_size
     array = (config.window_tokens + 1) * row
     counts = count_parameters(
@@ -59,7 +59,7 @@ def working_bytes(config: Config, observation_size: int, action_size: int) -> in
 
 
 def job_bytes(jobs: Sequence[Job]) -> dict[Any, tuple[int, int]]:
-    """State and working bytes of a lane, by program."""
+    """State bytes and temporary bytes of a lane, by program."""
     examples = {job.program: job for job in jobs}
     return {
         program: (
@@ -75,35 +75,35 @@ def job_bytes(jobs: Sequence[Job]) -> dict[Any, tuple[int, int]]:
 
 
 def lanes_at_once(jobs: Sequence[Job], strategy: str, workers: int, memory: int) -> int:
-    """How many lanes fit in ``memory`` bytes: of a device under ``vmap``, of the machine else.
+    """Number of lanes that fit in ``memory`` bytes: per device (``vmap``), or in total (``map``).
 
-    Under ``vmap`` all lanes of a device advance together; else as many as there are workers do, and
-    the others only keep their state.
+    Under ``vmap``, all lanes of a device advance together. Under ``map``, one lane per worker
+    advances, and the other lanes only need memory for their states.
 
     Raises:
-        UserError: when not even one fits.
+        UserError: when not even one lane fits.
     """
     state, work = (max(sizes) for sizes in zip(*job_bytes(jobs).values(), strict=True))
     usable = int(_HEADROOM * memory)
     if strategy == "vmap":
         fit = usable // (state + work)
     else:
-        # A lane more than are meant to be: while a wave's last lane is trained, the next begins.
+        # One more lane, because the next wave begins while the last lane of a wave is trained.
         busy = min(workers, max(1, usable // (state + work)))
         fit = (usable - busy * work) // state - (workers - 1)
     if fit < 1 and state + work > usable:
         raise UserError(
-            f"one lane needs {(state + work) / 2**30:,.1f} GiB and {usable / 2**30:,.1f} of the "
-            f"{memory / 2**30:,.1f} there are may be used; lower replay_capacity, hidden_size, "
+            f"one lane needs {(state + work) / 2**30:,.1f} GiB, but only {usable / 2**30:,.1f} of "
+            f"{memory / 2**30:,.1f} GiB may be used; lower replay_capacity, hidden_size, "
             "batch_size or history_length"
         )
     return max(1, fit)
 
 
 def usable_memory() -> int:
-    """Bytes of the device's own memory, or of what this process may use of the machine's.
+    """Bytes of the device's memory, or of the machine's memory that this process may use.
 
-    Of the latter so much that the share of it that lanes may take leaves room for the process.
+    The latter is reduced, so that the fraction for lanes leaves space for the process itself.
     """
     limit = (workers()[0].memory_stats() or {}).get("bytes_limit")
     if limit:

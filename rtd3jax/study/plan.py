@@ -1,4 +1,4 @@
-"""What a sweep will do: its cells, and what they will cost, before anything is compiled."""
+"""The plan of a sweep: its cells, and an estimate of their memory and time."""
 
 import dataclasses
 import itertools
@@ -20,7 +20,7 @@ from rtd3jax.training.run import make_jobs
 
 @dataclasses.dataclass(frozen=True)
 class Grid:
-    """The product of these: environment × disturbances × algorithms × history lengths."""
+    """All combinations of one environment, disturbances, algorithms and history lengths."""
 
     env: str
     disturbances: tuple[str, ...]
@@ -29,7 +29,7 @@ class Grid:
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Fields of the configuration that differ from the defaults."""
     own_settings: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
-    """Fields in which an algorithm differs from ``settings``, by its name."""
+    """Fields in which an algorithm differs from ``settings``, by the algorithm's name."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Cell:
 
     @property
     def key(self) -> dict[str, Any]:
-        """The columns by which the tables know it."""
+        """The columns that identify the cell in tables."""
         return {
             "env": self.env,
             "disturbance": self.disturbance,
@@ -56,7 +56,7 @@ class Cell:
         return make(self.env, disturbance, **parameters)
 
     def to_dict(self) -> dict[str, Any]:
-        """As in config.json."""
+        """The fields as in config.json."""
         return {"env": self.env, "disturbance": self.disturbance, **self.config.to_dict()}
 
     @classmethod
@@ -67,7 +67,7 @@ class Cell:
 
 
 def label(job: Job) -> str:
-    """A cell in a few words, for people."""
+    """A job's cell in a few words, for messages."""
     cell, _ = job.key
     length = f" l={cell.config.history_length}" if cell.config.history_length else ""
     return f"{cell.config.algorithm}{length} {cell.disturbance}"
@@ -83,32 +83,32 @@ def make_cells(grids: Iterable[Grid], overrides: dict[str, Any]) -> list[Cell]:
         combinations = itertools.product(grid.disturbances, grid.algorithms, grid.history_lengths)
         for disturbance, algorithm, length in combinations:
             with warnings.catch_warnings():
-                # A list of lengths is for the agents that have windows; td3 runs once.
+                # Several lengths only apply to agents with windows; td3 occurs once.
                 warnings.simplefilter("ignore")
                 own = grid.own_settings.get(algorithm, {})
                 settings = {**grid.settings, **own, **overrides}
                 config = Config(algorithm=algorithm, history_length=length, **settings)
             cells[Cell(grid.env, disturbance, config)] = None
     if not cells:
-        raise UserError("the sweep has no cells: give at least one of every list")
+        raise UserError("the sweep has no cells: every list needs at least one entry")
     return list(cells)
 
 
 def cell_jobs(
     cells: Sequence[Cell], seeds: Sequence[int], strategy: str, stages: Sequence[int] = ()
 ) -> list[Job]:
-    """A job per cell and seed, owned by ``(cell, seed)``.
+    """A job for each cell and seed, with key ``(cell, seed)``.
 
     Side by side (``vmap``), all history lengths in an environment share the program of the longest
     one: there, a wider matrix product costs almost nothing more. One by one (``map``), each history
     length has a program of its own.
 
     Args:
-        cells: of the study.
-        seeds: of each cell.
+        cells: the cells of the study.
+        seeds: the seeds of each cell.
         strategy: ``map`` or ``vmap``.
-        stages: how many cells there were before each time that cells were added to the study. A
-            longer window that comes later does not change the program of those before it.
+        stages: number of cells before each addition of cells to the study. A longer window that is
+            added later does not change the program of earlier cells.
     """
     windows = _windows(cells, stages) if strategy == "vmap" else [None] * len(cells)
     return [
@@ -119,7 +119,7 @@ def cell_jobs(
 
 
 def _windows(cells: Sequence[Cell], stages: Sequence[int]) -> list[int]:
-    """Of each cell, the longest window in its environment among the cells up to its own stage."""
+    """For each cell, the longest window of its environment in the cells up to its stage."""
     longest: dict[str, int] = {}
     found: list[int] = []
     for end in (*stages, len(cells)):
@@ -132,13 +132,13 @@ def _windows(cells: Sequence[Cell], stages: Sequence[int]) -> list[int]:
 
 @dataclasses.dataclass(frozen=True)
 class Cost:
-    """What a sweep is expected to take.
+    """The estimated memory and time of a sweep.
 
     Attributes:
-        programs: to compile.
-        state_bytes: of the largest lane's state.
-        working_bytes: that the largest lane needs besides while it advances.
-        seconds: of computing, without compiling; see `rtd3jax.study.time_estimate`.
+        programs: number of programs to compile.
+        state_bytes: bytes of the state of the largest lane.
+        working_bytes: temporary bytes of the largest lane while it advances.
+        seconds: time without compilation; see `rtd3jax.study.time_estimate`.
     """
 
     programs: int
@@ -150,24 +150,24 @@ class Cost:
 def estimate(
     jobs: Sequence[Job], strategy: str, say: Callable[[str], None] = lambda line: None
 ) -> Cost:
-    """Count programs, bytes from shapes, and time some programs; ``say`` takes lines meanwhile."""
+    """Count programs and bytes, and time some programs; ``say`` receives lines of progress."""
     sizes = job_bytes(jobs)
     state, work = (max(column) for column in zip(*sizes.values(), strict=True))
     return Cost(len(sizes), state, work, study_seconds(jobs, strategy, update_flops, say))
 
 
 def update_flops(config: Config) -> float:
-    """Operations of the products of an environment step's updates, those between steps spread out.
+    """Floating-point operations of the updates' matrix products, per environment step.
 
-    A layer's backward pass costs two forward passes, one for its weights and one for what it sends
-    back. A window's first token has no carry and so no recurrent product; nothing is sent back into
-    a carry from the replay. Counts what grows with H squared: the
-    narrow products of the encoders and outputs are left out. tests/study/test_plan.py compares it
-    with XLA's own count.
+    The backward pass of a layer takes two forward passes, one for the gradient of its weights and
+    one for the gradient of its input. The first token of a window has no carry, and so no recurrent
+    product. No gradient flows into a carry from the replay. Only products that grow with H squared
+    are counted; the small products of encoders and outputs are left out. tests/study/test_plan.py
+    compares the result with XLA's count.
     """
     variant, batch, width = AGENTS[config.algorithm], config.batch_size, config.hidden_size
     layer = 2.0 * batch * width * width
-    # Neither count depends on the narrow sizes of observations and actions.
+    # Neither count depends on the sizes of observations and actions, which are small.
     actor, critic = (make_part(variant, role, config.memory, 1, 1, width) for role in _ROLES)
 
     def token(network: Network) -> tuple[float, float]:
@@ -180,11 +180,11 @@ def update_flops(config: Config) -> float:
     segments = config.replay == "segments"
 
     def present(network: Network) -> float:
-        """The current token alone, and what follows the memory."""
+        """The current token, and the layers after the memory."""
         return network.reads.memory_has_current * sum(token(network)) + head(network)
 
     def forward(network: Network) -> float:
-        """At a history and a current token that is not among it."""
+        """A history, and a current token that is not part of the history."""
         if not network.reads.memory or network.reads.carry_from_replay:
             return present(network)
         if segments:
@@ -193,12 +193,12 @@ def update_flops(config: Config) -> float:
         return config.window_tokens * sum(token(network)) - token(network)[1] + present(network)
 
     def passed(network: Network, burn_in: int) -> float:
-        """One pass over the tokens of all segments."""
+        """A pass over the tokens of all segments."""
         length = config.segment_steps
         return (burn_in + length) / length * sum(token(network))
 
     def recorded(network: Network) -> float:
-        """At what was done: a segment's own tokens."""
+        """The recorded actions, which are part of the segment's tokens."""
         if segments and network.reads.memory and not network.reads.carry_from_replay:
             return passed(network, config.window_tokens) + head(network)
         return forward(network)
@@ -228,11 +228,11 @@ def plan_text(
     memory: int,
     say: Callable[[str], None] = lambda line: None,
 ) -> str:
-    """What a sweep will do and what it will cost, for people; ``memory`` in bytes."""
+    """The plan of a sweep as text, with memory and time; ``memory`` is in bytes."""
     count = len(workers())
     cost = estimate(jobs, strategy, say)
     fit = lanes_at_once(jobs, strategy, count, memory)
-    waits = f"; {len(jobs) - fit:,} wait for their turn" if fit < len(jobs) else ""
+    waits = f"; the other {len(jobs) - fit:,} wait" if fit < len(jobs) else ""
     lines = [f"{len(cells)} cells × {len(seeds)} seeds = {len(jobs)} lanes"]
     for cell in cells:
         config = cell.config
@@ -242,14 +242,14 @@ def plan_text(
         )
     lines += [
         f"programs to compile: {cost.programs}",
-        f"memory of the largest lane: {cost.state_bytes / 2**20:,.1f} MiB kept (parameters, "
-        f"optimisers, replay, carries), {cost.working_bytes / 2**20:,.1f} MiB more while it "
-        "advances (activations, gradients)",
+        f"memory of the largest lane: {cost.state_bytes / 2**20:,.1f} MiB of state "
+        "(parameters, optimisers, replay, carries), and "
+        f"{cost.working_bytes / 2**20:,.1f} MiB while it advances (activations, gradients)",
         f"lanes that fit in {memory / 2**30:,.1f} GiB"
         f"{' of a device' if strategy == 'vmap' else ''}: {min(fit, len(jobs)):,}{waits}",
         f"time: about {_duration(cost.seconds)} on {count} "
         f"{'cores' if workers()[0].platform == 'cpu' else 'devices'}, "
-        "as measured just now, without compiling",
+        "measured just now, without compilation",
     ]
     return "\n".join(lines)
 

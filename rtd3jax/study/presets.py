@@ -1,7 +1,8 @@
-"""Prepared studies of the sweep: a quick one, and the paper's with the evidence's settings.
+"""Presets of the sweep: a quick study, and the paper's studies with tuned settings.
 
 The paper states no hyper-parameters. experiments/rover_search.py and experiments/pendulum_search.py
-found these, on seeds that are not reported; docs/what_the_paper_leaves_open.md says why they help.
+found these settings, with seeds that are not reported; docs/what_the_paper_leaves_open.md explains
+why they help.
 """
 
 from typing import Any
@@ -22,13 +23,13 @@ ROVER_SETTINGS: dict[str, Any] = {
     "eval_every": 2_000,
     "precision": "float32",
 }
-"""One setting for all agents."""
+"""The same settings for all agents."""
 
 PENDULUM_STEPS = 30_000
 PENDULUM_STEPS_FACTOR = {"h-td3": 2}
 PENDULUM_DISTURBANCES = ("temporal-sine", "random-sine", "noise", "hidden")
 ACTION_HISTORY_DISTURBANCES = ("none", "temporal-bias", "noise:sigma=1.0")
-"""Under which the paper compares `lstm-td3` with and without past actions, besides the others."""
+"""Disturbances under which the paper also compares `lstm-td3` without past actions."""
 PENDULUM_HISTORY_LENGTHS = (1, 3, 6, 10, 20)
 PENDULUM_SETTINGS: dict[str, Any] = {
     "batch_size": 50,
@@ -51,7 +52,7 @@ PENDULUM_OWN_SETTINGS: dict[str, dict[str, Any]] = {
         "policy_delay": 4,
     },
 }
-"""h-td3's critics read carries that an actor of long ago stored, and the actor moves on."""
+"""Settings of h-td3, whose critics read carries that an old version of the actor stored."""
 
 _IN_MINUTES: dict[str, Any] = {
     "total_steps": 36_000,
@@ -61,7 +62,7 @@ _IN_MINUTES: dict[str, Any] = {
     "actor_learning_rate": 5e-3,
     "eval_every": 1_000,
 }
-"""What makes a rover's study one of minutes: half the width and the steps, larger rates."""
+"""Settings for a rover study of minutes: half the width and steps, larger learning rates."""
 
 _ROVER = Grid(
     "rover",

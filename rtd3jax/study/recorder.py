@@ -1,4 +1,4 @@
-"""Lanes written down as they end, and the log as they go."""
+"""Writes the files of lanes when they end, and the log during training."""
 
 import json
 import time
@@ -18,7 +18,7 @@ from rtd3jax.training.run import curves_of, evaluation_steps, failure_of, metric
 
 
 class Recorder:
-    """Writes lanes down as they end, and the log as they go."""
+    """Writes the files of lanes when they end, and the log during training."""
 
     def __init__(
         self,
@@ -30,9 +30,10 @@ class Recorder:
         *,
         keep: bool = False,
     ):
-        """Without ``interim``, tables and page are left to whoever started this process.
+        """Create the recorder.
 
-        With ``keep``, a lane's last checkpoint stays when it ends.
+        Without ``interim``, another process updates the tables and the page. With ``keep``, the
+        last checkpoint of a lane is kept when the lane ends.
         """
         self._directory = directory
         self._checkpoints = checkpoints
@@ -45,7 +46,7 @@ class Recorder:
         self._keep_checkpoints = keep
 
     def update(self, group: Group) -> None:
-        """Take note of a chunk that ``group`` has done, of its end, or of its error."""
+        """Record a chunk of ``group``, its end, or its error."""
         if group.error is not None:
             reason = str(group.error).splitlines()[0] if str(group.error) else repr(group.error)
             for job in group.jobs:
@@ -54,16 +55,16 @@ class Recorder:
                 self._complaints.append(f"{label(job)} seed {seed} failed: {reason}")
             return
         self._log(group)
-        # An event may be read late, after the one that already kept the group.
+        # An event may arrive after the one at which the group was recorded.
         if group.finished and group.state is not None:
             for job, state in group.lanes():
                 stays = self._keep_checkpoints and int(state.failure) == HEALTHY
-                if stays:  # first, so that no lane is there without it
+                if stays:  # first, so that no lane has a file but no checkpoint
                     self._checkpoints.save([(job, state)], group, group.step, kept=1)
                 self._keep(job, state)
                 if not stays:
                     self._checkpoints.discard(job)
-            group.state = None  # its replay is no longer needed
+            group.state = None  # frees the replay
             if self._interim is not None:
                 self._interim.refresh()
 
@@ -77,7 +78,7 @@ class Recorder:
                 for k in range(self._logged.get(id(job), 0), reached):
                     lane = {**cell.key, "seed": seed, "step": int(steps[k])}
                     if tuple(lane.values()) in self._there:
-                        continue  # the lane went on from a checkpoint before this evaluation
+                        continue  # the log has this row from before a restart
                     row = {
                         **lane,
                         "return": _json_number(curve[k]),

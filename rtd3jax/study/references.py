@@ -1,4 +1,4 @@
-"""Policies that need no training, evaluated for comparison."""
+"""Evaluates policies that need no training, for comparison."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -16,20 +16,20 @@ from rtd3jax.study.plan import Cell
 
 EPISODES = 1_000
 SIMULATED_EPISODES = 100
-"""Where a simulator on the host plays them."""
+"""Episodes in a simulator on the host, which is slower."""
 
 
 def references_of(cells: Sequence[Cell]) -> list[Reference]:
-    """Uniform random, and the environment's own baselines, on each environment of a study."""
+    """The random policy and the baselines, evaluated in each environment of a study."""
     distinct = {(cell.env, cell.disturbance): cell for cell in cells}
     return [reference for cell in distinct.values() for reference in references_on(cell)]
 
 
 def references_on(cell: Cell) -> list[Reference]:
-    """Those of one cell's environment.
+    """The random policy and the baselines, evaluated in the environment of a cell.
 
     Raises:
-        UserError: when a baseline fails, or is no policy that fits the environment.
+        UserError: when a baseline fails, or does not fit the environment.
     """
     env = cell.make_env()
     policies: dict[str, Any] = {"random": random_policy(env)}
@@ -42,7 +42,7 @@ def references_on(cell: Cell) -> list[Reference]:
                 policies[name] = made if hasattr(made, "step") else constant_policy(made)
         except UserError:
             raise
-        except Exception as error:  # a user's function may do anything
+        except Exception as error:  # a user's function may raise any error
             reason = first_line(error)
             raise UserError(f"the baseline {name!r} of {cell.env} failed: {reason}") from error
     episodes = SIMULATED_EPISODES if is_simulated(env) else EPISODES

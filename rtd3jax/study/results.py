@@ -1,8 +1,8 @@
 """Tidy result tables and their Parquet files.
 
-A table is a list of dict rows or a ``pyarrow.Table``; each file holds one table of one of the
-schemas below. Files are replaced atomically and depend only on the set of rows, never on the order
-in which training lanes finished.
+A table is a list of dict rows or a ``pyarrow.Table``; each file holds a table of one of the schemas
+below. Files are replaced atomically. Their content depends on the set of rows, but not on the order
+in which lanes ended.
 """
 
 import io
@@ -19,9 +19,8 @@ import pyarrow.parquet as pq
 from rtd3jax.errors import UserError
 from rtd3jax.system.files import user_path, write_bytes_atomically
 
-# Policies evaluated for comparison that need no training: uniform random, and the baselines of the
-# environment. Their EPISODES rows carry history_length 0 and this seed, because neither has a
-# meaning for them.
+# Reference policies need no training: uniform random, and the baselines of the environment. Their
+# EPISODES rows have history_length 0 and this seed, because neither has a meaning for them.
 REFERENCE_SEED = -1
 
 # What identifies one experimental cell; a cell plus a seed is one training lane.
@@ -55,7 +54,7 @@ def _schema(index: pa.Field) -> pa.Schema:
 CURVES = _schema(pa.field("step", pa.int64(), nullable=False))
 # Final evaluation: one row per lane and evaluation episode, numbered from 0.
 EPISODES = _schema(pa.field("episode", pa.int32(), nullable=False))
-# Metrics of learning: a row per lane, evaluation and metric, averaged since the evaluation before.
+# Metrics of learning: a row per lane, evaluation and metric, averaged since the last evaluation.
 METRICS = pa.schema(
     [
         *_LANE,
@@ -67,7 +66,7 @@ METRICS = pa.schema(
 
 
 def key_columns(schema: pa.Schema) -> list[str]:
-    """Names of the columns that identify a row: all but the floating-point measurements."""
+    """Names of the columns that identify a row: all except the floating-point measurements."""
     return [field.name for field in schema if not pa.types.is_floating(field.type)]
 
 
@@ -76,8 +75,8 @@ def write_table(
 ) -> None:
     """Write ``rows`` (dicts or a Table, one entry per column of ``schema``) to a Parquet file.
 
-    Rows are sorted by ``key_columns(schema)``. Two rows with equal keys raise ``UserError``: one
-    of them would count twice, and their order could not be made reproducible.
+    Rows are sorted by ``key_columns(schema)``. Two rows with equal keys raise ``UserError``: their
+    order would not be reproducible.
     A missing measurement is NaN, never None.
     """
     table = _as_table(rows, schema)
@@ -155,17 +154,17 @@ def _describe(schema: pa.Schema) -> str:
 
 
 def is_trained(table: pd.DataFrame) -> pd.Series:
-    """Which rows of EPISODES are of trained agents: bool [rows]; the others are of references."""
+    """Which rows of EPISODES belong to trained agents, not to references: bool [rows]."""
     return table["seed"] >= 0
 
 
 def reference_names(table: pd.DataFrame) -> list[str]:
-    """Names of the references in EPISODES: random first, the others by the alphabet."""
+    """Names of the references in EPISODES: random first, then alphabetically."""
     names = set(table.loc[~is_trained(table), "algorithm"])
     return sorted(names, key=lambda name: (name != "random", name))
 
 
 def rounded_number(value: SupportsFloat) -> float | None:
-    """For JSON: five significant digits, or None for what is not finite."""
+    """A number for JSON, with five significant digits; None for infinity and NaN."""
     value = float(value)
     return float(f"{value:.5g}") if math.isfinite(value) else None

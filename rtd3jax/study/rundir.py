@@ -1,7 +1,7 @@
-"""A run directory: what study is in it, and how that may grow.
+"""A run directory: the study in it, and additions to the study.
 
-Beside the configuration, which is here, it holds a file for each lane (`lane_files`), the log
-(`log`) and what is derived from the lanes (`derive`).
+The directory holds the configuration (this module), a file for each lane (`lane_files`), the log
+(`log`), and results that are derived from the lanes (`derive`).
 """
 
 import json
@@ -38,18 +38,17 @@ from rtd3jax.training.lanes import Job
 
 CONFIG = "config.json"
 _PATIENCE, _PATIENCE_SECONDS = 10, 0.1
-"""How often, and how long, a shard waits for another one that lets the study grow."""
+"""How often, and for how many seconds, a shard waits for another that extends the study."""
 PACKAGES = ("rtd3jax", "jax", "jaxlib", "flax", "optax", "gymnax", "numpy")
 
 
 class RunDirectory:
     """The directory of one sweep.
 
-    What is there already is gone on with, and grows by what is asked for besides.
+    An existing study is continued, and seeds, cells and steps are added to it.
 
     Raises:
-        UserError: when a lane that is there would become another one, or when the directory cannot
-            be written.
+        UserError: when an existing lane would change, or the directory cannot be written.
     """
 
     def __init__(
@@ -69,7 +68,7 @@ class RunDirectory:
 
     @classmethod
     def open(cls, path: str | Path) -> "RunDirectory":
-        """The study that is in ``path`` already."""
+        """Open the existing study in ``path``."""
         there = Contents.read(user_path(path) / CONFIG)
         directory = cls(path, there.cells, there.seeds, there.episodes, prepare=False)
         directory.contents = there
@@ -77,17 +76,17 @@ class RunDirectory:
 
     @property
     def cells(self) -> list[Cell]:
-        """All cells, also those that were not asked for now."""
+        """All cells of the study, also those that this sweep does not name."""
         return list(self.contents.cells)
 
     @property
     def seeds(self) -> list[int]:
-        """Of each cell's lanes."""
+        """The seeds of each cell."""
         return list(self.contents.seeds)
 
     @property
     def episodes(self) -> int:
-        """Of the final evaluation of a lane."""
+        """Number of episodes in the final evaluation of a lane."""
         return self.contents.episodes
 
     def jobs(self, strategy: str) -> list[Job]:
@@ -95,10 +94,11 @@ class RunDirectory:
         return self.contents.jobs(strategy)
 
     def plan(self) -> str:
-        """Find what the study will consist of; nothing is written.
+        """Determine the contents of the study, without writing anything.
 
         Returns:
-            What is new in it, or that more is there than was asked for; for people, mostly empty.
+            A message about additions, or about cells and seeds that this sweep does not name; it
+            is usually empty.
         """
         config = self.path / CONFIG
         if not config.exists():
@@ -117,16 +117,16 @@ class RunDirectory:
             return f"added to {self.path}: {what_was_added(there, self.contents)}"
         if grown(self._asked, there) != self._asked:
             return (
-                f"{self.path} holds more than was asked for: all of its {len(there.cells)} cells "
-                f"× {len(there.seeds)} seeds go on"
+                f"{self.path} holds more cells or seeds than this command names: all of its "
+                f"{len(there.cells)} cells × {len(there.seeds)} seeds are continued"
             )
         return ""
 
     def prepare(self) -> str:
-        """Make the directory, or let the study that is there grow; what `plan` says.
+        """Create the directory, or extend its study; return the message of `plan`.
 
-        It is safe at any moment: the configuration is replaced as a whole, and grows only while no
-        process writes to the directory.
+        The configuration is replaced atomically, and only while no other process writes to the
+        directory.
         """
         config = self.path / CONFIG
         try:
@@ -159,20 +159,20 @@ class RunDirectory:
                         _write_config(config, content)
                     return news
             except UserError:
-                # Perhaps another shard of the same command is letting it grow just now.
+                # Another shard of the same command may be extending the study at this moment.
                 if last:
                     raise
                 time.sleep(_PATIENCE_SECONDS)
-        raise AssertionError("the last try returns or raises")
+        raise AssertionError("the last attempt returns or raises")
 
     def refresh(self) -> bool:
-        """See what another process has added; whether there is something."""
+        """Read additions of another process; return whether there are any."""
         before = self.contents
         self.plan()
         return self.contents != before
 
     def _check_longer(self, there: Contents) -> None:
-        """More steps must be able to go on where lanes are."""
+        """Raise UserError if existing lanes cannot continue to more steps."""
         for before, after in longer_cells(there, self.contents):
             steps = after.config.total_steps
             ended = 0
@@ -185,19 +185,19 @@ class RunDirectory:
                     reason = why_not_longer(before.to_dict(), after.to_dict(), max(kept))
                     if reason is not None:
                         raise UserError(
-                            f"--out {self.path}: {cell_words(after)} cannot go on to {steps:,} "
+                            f"--out {self.path}: {cell_words(after)} cannot continue to {steps:,} "
                             f"steps: {reason}; choose another directory"
                         )
             if ended:
                 raise UserError(
-                    f"--out {self.path}: {cell_words(after)} cannot go on to {steps:,} steps: "
-                    f"{ended} of its lanes ended at {before.config.total_steps:,} and kept no "
-                    "checkpoint (--keep-checkpoints keeps them); choose another directory, or "
+                    f"--out {self.path}: {cell_words(after)} cannot continue to {steps:,} steps: "
+                    f"{ended} of its lanes ended at {before.config.total_steps:,} without a "
+                    "checkpoint (--keep-checkpoints keeps it); choose another directory, or "
                     f"remove {self.path / 'lanes' / cell_name(after)} to train them from the start"
                 )
 
     def has_ended(self) -> bool:
-        """Whether no lane is left to train: each is done, or was lost, or failed."""
+        """Whether every lane has ended: it was trained to its end, was lost, or failed."""
         return all(
             self.lanes.is_done(cell, seed) or self.lanes.error_path(cell, seed).exists()
             for cell in self.cells
@@ -205,7 +205,7 @@ class RunDirectory:
         )
 
     def _check_format(self, config: Path) -> None:
-        """Do not train further lanes beside those whose agents read actions in other units."""
+        """Raise UserError for a run of version 0.1, whose agents read actions in other units."""
         if read_config(config).get("format", 1) == FORMAT or self.has_ended():
             return
         for cell in self.cells:
@@ -214,15 +214,16 @@ class RunDirectory:
             if np.any(interface.action_low != -1.0) or np.any(interface.action_high != 1.0):
                 raise UserError(
                     f"--out {self.path} was begun by rtd3jax 0.1, whose agents read the actions of "
-                    f"{cell.env} in the environment's units; agents now read half ranges, and the "
-                    "two do not belong in one table: choose another directory"
+                    f"{cell.env} in the environment's units; agents now read half ranges, so the "
+                    "results are not comparable: choose another directory"
                 )
 
 
 def _is_own(entry: Path) -> bool:
-    """Whether this may stand in a directory before its study does.
+    """Whether ``entry`` may exist in a directory without a study.
 
-    A lock, or what a process left that was killed while it wrote the configuration.
+    It may be a lock, or a temporary file of a process that was killed while it wrote the
+    configuration.
     """
     half_written = entry.name.startswith(".config.json.") and entry.name.endswith(".tmp")
     return entry.name.startswith(".lock") or half_written

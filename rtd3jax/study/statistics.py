@@ -4,8 +4,8 @@ The unit of replication is the seed, not the episode: episodes of one trained ag
 independent evidence about its algorithm. The aggregates follow Agarwal, Schwarzer, Castro,
 Courville and Bellemare, "Deep Reinforcement Learning at the Edge of the Statistical Precipice",
 NeurIPS 2021: the interquartile mean (IQM), percentile bootstrap intervals and the probability of
-improvement. A cell is a single task, so their bootstrap stratified by task is here a plain
-bootstrap over seeds.
+improvement. A cell is a single task, so their bootstrap, which is stratified by task, is a plain
+bootstrap over seeds here.
 """
 
 import math
@@ -43,8 +43,8 @@ def seed_means(episodes: pd.DataFrame) -> pd.DataFrame:
     """Average the EPISODES rows of each lane.
 
     Returns one row per (cell, seed) with columns env, disturbance, algorithm, history_length,
-    seed, return and true_return (float64). A lane with any NaN episode has a NaN mean: averaging
-    only the episodes that survived would flatter a policy that sometimes diverges.
+    seed, return and true_return (float64). A lane with a NaN episode has a NaN mean: the mean of
+    the other episodes would be too high for a policy that sometimes diverges.
     """
     lanes = episodes.astype({"return": np.float64, "true_return": np.float64})
     grouped = lanes.groupby([*CELL, "seed"], sort=True, as_index=False)
@@ -54,7 +54,7 @@ def seed_means(episodes: pd.DataFrame) -> pd.DataFrame:
 def summarise(values: ArrayLike) -> Summary:
     """Summarise ``values`` [seeds], one number per seed; NaN and infinity mark a failed seed.
 
-    The IQM cuts ``floor(n / 4)`` seeds from each side, so that with n < 4 it equals the mean.
+    The IQM removes ``floor(n / 4)`` seeds from each side, so it equals the mean for n < 4.
     """
     finite, failed = _finite(values)
     n = finite.size
@@ -68,15 +68,16 @@ def summarise(values: ArrayLike) -> Summary:
 
 
 def iqm_bands(values: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """`summarise` at every point of a curve at once.
+    """`summarise` at every point of a curve.
 
-    ``values`` [seeds, K] gives the seeds with a finite value int [K], and their IQM with the bounds
-    of its interval, float64 [K] each: nan where no seed is left, the bounds where fewer than two.
+    For ``values`` [seeds, K], it returns the number of seeds with a finite value, int [K], and the
+    IQM with the bounds of its interval, float64 [K] each. The IQM is nan without a seed, and the
+    bounds are nan with fewer than two seeds.
     """
     array = np.asarray(values, np.float64)
     finite = np.isfinite(array)
     iqm, low, high = (np.full(array.shape[1], np.nan) for _ in range(3))
-    # Points at which the same seeds are left share one set of resamples.
+    # Points with the same seeds share one set of resamples.
     patterns, which = np.unique(finite, axis=1, return_inverse=True)
     for index in range(patterns.shape[1]):
         points = np.flatnonzero(which.ravel() == index)
@@ -89,10 +90,10 @@ def iqm_bands(values: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray, np
 
 
 def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> float:
-    """Probability that a random seed of ``x`` [n] beats one of ``y`` [m]; a tie counts half.
+    """Probability that a random seed of ``x`` [n] exceeds one of ``y`` [m]; a tie counts half.
 
     This is the Mann-Whitney U statistic divided by n * m. Failed (non-finite) seeds are left out;
-    nan when either side has none left.
+    the result is nan if a side has no seed.
     """
     first, _ = _finite(x)
     second, _ = _finite(y)
@@ -107,11 +108,11 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> float:
 class Comparison:
     """How much better ``y`` is than ``x``, with 95 % bootstrap intervals over seeds."""
 
-    pairs: int  # seeds that both have, by which the difference is paired; 0 when it is not
+    pairs: int  # common seeds of a paired difference; 0 if it is not paired
     difference: float  # mean of y minus x; nan when either side has no finite value
     difference_low: float  # nan when either side has fewer than two
     difference_high: float
-    improvement: float  # probability that a random seed of y beats one of x
+    improvement: float  # probability that a random seed of y exceeds one of x
     improvement_low: float
     improvement_high: float
 
@@ -119,9 +120,9 @@ class Comparison:
 def compare(x: Mapping[int, float], y: Mapping[int, float]) -> Comparison:
     """Compare the value of each seed of ``y`` with those of ``x``, the baseline.
 
-    Equal seeds meet equal starts, so the difference is that of the seeds with a finite value on
-    both sides, pair by pair, where there are two of them at least; else that of the two means.
-    The probability of improvement is over all seeds. Failed seeds (non-finite values) are left out.
+    Equal seeds have equal starts, so the difference is paired over the seeds with a finite value on
+    both sides, if there are at least two. Otherwise it is the difference of the two means. The
+    probability of improvement is over all seeds. Failed seeds (non-finite values) are left out.
     """
     first, second = (
         {seed: value for seed, value in sorted(values.items()) if math.isfinite(value)}
@@ -141,7 +142,7 @@ def compare(x: Mapping[int, float], y: Mapping[int, float]) -> Comparison:
     improvement = probability_of_improvement(of_y, of_x)
     if min(of_x.size, of_y.size) < 2:
         return Comparison(len(common), difference, nan, nan, improvement, nan, nan)
-    # How often each seed is drawn, [RESAMPLES, n] of either side.
+    # How often each seed is drawn, [RESAMPLES, n] for each side.
     random = np.random.default_rng(BOOTSTRAP_SEED)
     if common:
         drawn = [random.multinomial(pairs.size, np.full(pairs.size, 1 / pairs.size), RESAMPLES)]
@@ -157,13 +158,13 @@ def compare(x: Mapping[int, float], y: Mapping[int, float]) -> Comparison:
 
 
 def _percentiles(values: np.ndarray) -> tuple[float, float]:
-    """The bounds of the central 95 %."""
+    """The bounds of the central 95 % of ``values``."""
     low, high = np.quantile(values, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
     return float(low), float(high)
 
 
 def _finite(values: ArrayLike) -> tuple[np.ndarray, int]:
-    """The finite entries as float64 [n], and how many others there were."""
+    """The finite entries as float64 [n], and the number of other entries."""
     array = np.asarray(values, dtype=np.float64).ravel()
     finite = array[np.isfinite(array)]
     return finite, array.size - finite.size
@@ -175,7 +176,7 @@ def _iqm(values: np.ndarray, axis: int = -1) -> np.ndarray:
 
 def _bootstrap_interval(values: np.ndarray) -> tuple[Any, Any]:
     """95 % percentile bootstrap interval of the IQM of ``values`` [n >= 2, ...] over the seeds."""
-    # Sorted, because the resamples pick by position: the order of seeds must not matter.
+    # Sorted, because resamples choose positions: the order of seeds must not matter.
     result = stats.bootstrap(
         (np.sort(values, axis=0),),
         _iqm,

@@ -1,4 +1,4 @@
-"""How far a study is, read from its lanes' files, its log and its lock."""
+"""The state of a study, from the files of its lanes, its log and its lock."""
 
 from typing import Any
 
@@ -14,8 +14,8 @@ from rtd3jax.training.checkpoint import checkpoint_steps
 def ledger(directory: RunDirectory) -> list[dict[str, Any]]:
     """Each lane's state: done, lost, failed, running, interrupted (at a step), or planned.
 
-    Nothing is kept for it: it is read from the lanes' files, the log and the lock, so that it
-    cannot disagree with them.
+    The state is not stored: it is derived from the files of the lanes, the log and the lock, so it
+    always agrees with them.
     """
     begun = "running" if is_held(directory.path) else "interrupted"
     logged = steps_reached(read_log(directory.path / LOG))
@@ -40,7 +40,7 @@ def _lane_status(
     steps = checkpoint_steps(lanes.checkpoint_directory(cell, seed))
     kept = max(steps, default=0)
     reached = logged.get(lane_of({**cell.key, "seed": seed}), 0)
-    # A lane that is logged to its end but has no file was removed, to be trained again.
+    # If the log reaches the end but there is no file, the file was removed to train again.
     reached = max(kept, reached if reached < cell.config.total_steps else 0)
     reason = f"next start at step {kept:,}" if reached and begun != "running" else ""
     return {"status": begun if reached else "planned", "step": reached, "reason": reason}

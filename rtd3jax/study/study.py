@@ -1,4 +1,4 @@
-"""`Study`: what ``python -m rtd3jax.sweep`` does, from Python.
+"""`Study`: the sweep (``python -m rtd3jax.sweep``) as a Python class.
 
 study = rtd.Study(
     [rtd.Cell("rover", "ar1-slip", rtd.Config(algorithm=name)) for name in ("td3", "h-td3")],
@@ -39,15 +39,15 @@ class Study:
     """Cells with the same seeds, in a run directory.
 
     Args:
-        cells: what is trained: an environment, a disturbance and a configuration each.
-        seeds: of each cell's lanes.
-        out: the run directory. A study that is there already is gone on with; what is asked for
-            besides (seeds, cells, more steps of a cell) is added by `run`.
-        final_episodes: of the evaluation at a lane's end.
+        cells: the cells to train, each with an environment, a disturbance and a configuration.
+        seeds: the seeds of each cell.
+        out: the run directory. An existing study is continued; `run` adds seeds, cells and steps
+            that it does not have.
+        final_episodes: number of episodes of the evaluation at the end of a lane.
 
     Raises:
-        UserError: when two cells cannot be told apart in the tables, when a lane that is in
-            ``out`` would become another one, or when it cannot be written.
+        UserError: when tables cannot distinguish two cells, when an existing lane of ``out`` would
+            change, or when ``out`` cannot be written.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class Study:
             user_path(out), _distinct(cells), check_seeds(seeds), final_episodes, prepare=False
         )
         if (directory.path / CONFIG).exists():
-            directory.plan()  # to look at a study does not let it grow
+            directory.plan()  # opening a study does not extend it
         else:
             directory.prepare()
         self._directory = directory
@@ -85,13 +85,14 @@ class Study:
         """Train the lanes that are missing, then write tables, pictures and the page.
 
         Args:
-            quiet: no progress bar.
+            quiet: whether to omit the progress bar.
             page: whether to write ``report.html``.
-            log: trackers: ``tensorboard``, ``wandb``, ``mlflow``.
-            strategy: ``map`` or ``vmap``; by default what suits the backend.
-            checkpoint_seconds: between checkpoints of a lane; by default as the sweep's.
-            keep_checkpoints: whether a lane's last checkpoint stays when it ends, so that it can be
-                given more steps later.
+            log: names of trackers: ``tensorboard``, ``wandb``, ``mlflow``.
+            strategy: ``map`` or ``vmap``; by default ``map`` on a CPU and ``vmap`` on an
+                accelerator.
+            checkpoint_seconds: time between checkpoints of a lane; by default as in the sweep.
+            keep_checkpoints: whether to keep the last checkpoint of a lane that has ended, so that
+                it can continue to more steps later.
 
         Returns:
             A line for each lane that was lost or failed.
@@ -118,14 +119,14 @@ class Study:
         return complaints
 
     def status(self) -> pd.DataFrame:
-        """A row per lane: its cell, its seed, how far it is, and why it ended if it was lost."""
+        """A row per lane: its cell, its seed, its state, and the reason if it was lost."""
         return pd.DataFrame(ledger(self._directory))
 
     def tables(self) -> dict[str, pd.DataFrame]:
-        """The tables ``curves``, ``episodes`` and ``metrics``, of the lanes that are done.
+        """The tables ``curves``, ``episodes`` and ``metrics`` of the lanes that have ended.
 
         Raises:
-            UserError: when nothing was trained yet.
+            UserError: when no lane has ended yet.
         """
         schemas = {"curves": CURVES, "episodes": EPISODES, "metrics": METRICS}
         return {
@@ -134,7 +135,7 @@ class Study:
         }
 
     def figures(self) -> list[Path]:
-        """Draw learning curves and final returns again; the paths of the pictures."""
+        """Draw learning curves and final returns again; return the paths of the figures."""
         tables = self.tables()
         best = ceilings_of(self.path, self._directory.cells, compute=False)
         curves, episodes = tables["curves"], tables["episodes"]
@@ -144,29 +145,29 @@ class Study:
         ]
 
     def report(self) -> Path:
-        """Write the page again; its path."""
+        """Write the page again; return its path."""
         return write_page(self._directory)
 
     def policy(self, cell: Cell, seed: int) -> Policy:
         """The trained policy of a lane.
 
         Raises:
-            UserError: when the lane is not done, or was lost.
+            UserError: when the lane has not ended, or was lost.
         """
         return self._directory.lanes.policy(cell, seed)
 
 
 def _distinct(cells: Iterable[Cell]) -> list[Cell]:
-    """The cells, if each can be told from the others by what stands in tables."""
+    """The cells, if the columns of the tables distinguish them; else UserError."""
     found: dict[tuple[object, ...], Cell] = {}
     for cell in cells:
         if not isinstance(cell, Cell):
-            raise UserError(f"a study is made of rtd.Cell, not {type(cell).__name__}")
+            raise UserError(f"a study consists of rtd.Cell, not {type(cell).__name__}")
         key = tuple(cell.key.values())
         if key in found and found[key] != cell:
             raise UserError(
-                f"two cells are both {', '.join(map(str, key))}: tables tell cells apart by "
-                f"{', '.join(cell.key)} alone; put them in studies of their own"
+                f"two cells are both {', '.join(map(str, key))}: tables distinguish cells only by "
+                f"{', '.join(cell.key)}; put them in separate studies"
             )
         found[key] = cell
     if not found:

@@ -1,4 +1,4 @@
-"""The written summary of a study, as Markdown."""
+"""The summary of a study as Markdown."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -22,13 +22,12 @@ def summary_markdown(
 ) -> str:
     """Summarise a study.
 
-    ``config_lines`` maps setting names to values, shown in the order given. ``curves`` and
+    ``config_lines`` maps names of settings to values, in the order of the summary. ``curves`` and
     ``episodes`` have the columns of CURVES and EPISODES. Each of ``failures`` has the entries env,
-    disturbance, algorithm, history_length, seed, step and reason. ``ceilings`` are those of
-    `rtd3jax.study.ceilings` that are known.
+    disturbance, algorithm, history_length, seed, step and reason. ``ceilings`` are the known
+    ceilings of `rtd3jax.study.ceilings`.
 
-    Every cell that occurs anywhere, even only in a failure, gets a row, so that a cell whose
-    seeds were all lost is seen as missing instead of silently left out.
+    Every cell of any argument gets a row, so a cell whose seeds were all lost is visible.
     """
     lanes = seed_means(episodes)
     lines = ["# Study summary", "", "## Configuration", ""]
@@ -55,7 +54,7 @@ def summary_markdown(
 def _started_seeds(
     curves: pd.DataFrame, lanes: pd.DataFrame, failures: Sequence[Mapping]
 ) -> dict[tuple, set[int]]:
-    """The seeds seen anywhere, by cell (env, disturbance, algorithm, history length)."""
+    """The seeds in any table, by cell (env, disturbance, algorithm, history length)."""
     started: dict[tuple, set[int]] = {}
     columns = [*CELL, "seed"]
     for table in (curves[columns].drop_duplicates(), lanes.loc[is_trained(lanes), columns]):
@@ -79,7 +78,7 @@ def _task_section(
 ) -> list[str]:
     """Heading and table of one (env, disturbance)."""
     of_task = _select(lanes, task)
-    # The returns agree wherever the reward is not computed from disturbed quantities.
+    # The returns are equal if the reward is not computed from disturbed quantities.
     differs = not np.allclose(of_task["return"], of_task["true_return"], equal_nan=True)
     header = ["algorithm", "l", "seeds", "mean ± std", "IQM [low, high]"]
     header += ["true-state return"] if differs else []
@@ -123,7 +122,7 @@ def _task_section(
 
 
 def _failure_lines(failures: Sequence[Mapping]) -> list[str]:
-    """One list item per failed lane, in the order of cells, whatever order they failed in."""
+    """One list item per failed lane, in the order of cells."""
     if not failures:
         return ["none"]
     lines = []
@@ -156,7 +155,7 @@ def _interval(summary: Summary) -> str:
 
 
 def number(value: float) -> str:
-    """Four significant digits, but no exponent below a million."""
+    """A number with four significant digits, without an exponent below a million."""
     if 100 <= abs(value) < 1e6:
         return f"{value:.1f}"
     return f"{value:.4g}"

@@ -1,8 +1,8 @@
-"""How long a study will take here: its own programs, run for a second each.
+"""Estimates the time of a study by running some of its programs for a second each.
 
-A count of operations knows neither this machine nor what else runs on it. So some of a study's
-programs are compiled and timed, as many lanes side by side as there are workers; the time of the
-others follows from theirs by their operations.
+A count of operations does not take into account this machine and its load. So some programs of the
+study are compiled and timed on all workers together; the times of other programs are interpolated
+by their operations.
 """
 
 import threading
@@ -18,7 +18,7 @@ from rtd3jax.training.lanes import Job, compiled, stacked, workers
 from rtd3jax.training.loop import Program
 
 MOST_PROGRAMS = 4
-"""That are timed: each costs its compilation."""
+"""Maximum number of programs that are timed, because each must be compiled."""
 _SECONDS = 1.0
 
 
@@ -28,15 +28,15 @@ def study_seconds(
     operations: Callable[[Config], float],
     say: Callable[[str], None] = lambda line: None,
 ) -> float:
-    """Seconds that the jobs need with all workers, without compiling.
+    """Seconds that the jobs need with all workers, without compilation.
 
     Args:
-        jobs: a lane each.
-        strategy: ``map``: a worker trains lane after lane; ``vmap``: its share of a program's lanes
-            side by side.
-        operations: those of an environment step of a configuration, by which programs that are
-            not timed are placed among those that are.
-        say: takes a line before each measurement.
+        jobs: the jobs, one for each lane.
+        strategy: with ``map``, a worker trains one lane after the other; with ``vmap``, it trains
+            its share of a program's lanes together.
+        operations: returns the operations of a configuration per environment step, by which times
+            are interpolated.
+        say: receives a line before each measurement.
     """
     devices = len(workers())
     lanes: dict[Program, list[Job]] = {}
@@ -59,7 +59,7 @@ def study_seconds(
 
 
 def group_seconds(jobs: Sequence[Job]) -> float:
-    """Seconds of a worker for the lanes side by side, while the other workers do the same."""
+    """Seconds of a worker for these lanes, while the other workers do the same."""
     program = jobs[0].program
     steps, evaluations = zip(*_on_all_workers(jobs), strict=True)
     learning = max(0, program.config.total_steps - program.config.learning_starts)
@@ -67,7 +67,7 @@ def group_seconds(jobs: Sequence[Job]) -> float:
 
 
 def _on_all_workers(jobs: Sequence[Job]) -> list[tuple[float, float]]:
-    """Seconds of a step that learns, and of an evaluation, for each worker."""
+    """For each worker, the seconds of a step with updates, and of an evaluation."""
     devices = workers()
     together = threading.Barrier(len(devices))
     found: dict[int, tuple[float, float]] = {}
@@ -111,15 +111,15 @@ def _timed(
         jax.block_until_ready(state)
         return time.perf_counter() - began
 
-    # Rows of zeros take as long as what an environment gave. Steps are a whole number of updates.
-    together_at = config.environments  # steps are those of all environments
+    # Transitions of zeros take as long as others. The number of steps is a multiple of updates.
+    together_at = config.environments  # steps are counted over all environments
     start = config.first_learning_step * together_at
     block = max(config.update_every, together_at) * config.policy_delay
     seconds(start, start + block)
     together.wait()
     done, spent = 0, 0.0
     while spent < _SECONDS:
-        # Between two evaluations, which are timed by themselves.
+        # Between two evaluations, which are timed separately.
         first = start + (-start) % config.eval_every
         length = min(block, max(together_at, config.eval_every - together_at))
         spent += seconds(first, first + length)
@@ -136,7 +136,7 @@ def _filled_in(
     timed: Mapping[Program, float],
     operations: Callable[[Config], float],
 ) -> dict[Program, float]:
-    """A lane's seconds of every program: between two that were timed, in proportion."""
+    """The seconds of a lane of every program, interpolated between the timed programs."""
 
     def work(program: Program) -> float:
         return operations(program.config)

@@ -1,4 +1,4 @@
-"""What the trained agents of a run score under other disturbances than their own."""
+"""Tests the trained agents of a run under other disturbances."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -25,16 +25,16 @@ def transfer(
     cells: Sequence[Cell] | None = None,
     write: bool = True,
 ) -> pd.DataFrame:
-    """Test every trained policy of ``directory``; returns go to ``transfer.parquet``.
+    """Test every trained policy of ``directory``, and write returns to ``transfer.parquet``.
 
     Args:
-        directory: the run.
-        tested_on: disturbances; by default those of the run, for each environment its own.
-        episodes: for each policy and disturbance. A lane's seed is also that of its episodes, so
-            that agents of one seed meet the same ones.
-        cells: those of the run whose policies are tested; all by default.
-        write: whether to keep the table in the run directory.
-        say: takes a line where a disturbance does not suit some policies.
+        directory: the run directory.
+        tested_on: disturbances; by default those of the run for the same environment.
+        episodes: number of episodes for each policy and disturbance. The seed of a lane is also the
+            seed of its episodes, so agents with the same seed meet the same episodes.
+        cells: cells whose policies are tested; all cells by default.
+        write: whether to write the table to the run directory.
+        say: receives a line if a disturbance does not fit some policies.
 
     Raises:
         UserError: for an unknown disturbance, or when nothing is trained yet.
@@ -42,7 +42,7 @@ def transfer(
     rows: list[dict[str, Any]] = []
     environments: dict[tuple[str, str], Any] = {}
     problems: dict[tuple[str, str, str], int] = {}
-    # A file is read once, not for each disturbance.
+    # The file of a policy is read once for all disturbances.
     policy_of = functools.lru_cache(maxsize=len(directory.seeds))(directory.lanes.policy)
     for cell in directory.cells if cells is None else cells:
         own = list(dict.fromkeys(c.disturbance for c in directory.cells if c.env == cell.env))
@@ -81,9 +81,7 @@ def transfer(
     for (trained_on, tested, reason), agents in problems.items():
         say(f"not tested on {tested}: {agents} agents trained on {trained_on}: {reason}")
     if not rows:
-        raise UserError(
-            f"nothing in {directory.path} could be tested: --status tells what there is"
-        )
+        raise UserError(f"no policy in {directory.path} could be tested: --status prints the lanes")
     table = pd.DataFrame(rows, columns=[*COLUMNS, "true_return"])
     if write:
         write_bytes_atomically(directory.path / FILE, table.to_parquet(index=False))

@@ -116,9 +116,9 @@ def test_the_first_run_is_what_others_are_compared_with(runs):
     [
         (
             ("before", "elsewhere"),
-            "no finished cell of run .* run has rover .* c has pendulum",
+            "run has no finished cell .* run has rover .* c has pendulum",
         ),
-        (("before",), "compare takes two runs at least"),
+        (("before",), "compare needs at least two runs"),
         (("before", "before"), "is given twice"),
     ],
 )

@@ -18,10 +18,10 @@ def _config(path, **changes):
 
 def test_an_agent_that_is_not_registered_here_is_named_with_the_remedy(tmp_path):
     path = _config(tmp_path / "config.json", algorithm="my-own-td3")
-    with pytest.raises(rtd.UserError, match="my-own-td3.*register what is your own.*--import"):
+    with pytest.raises(rtd.UserError, match="my-own-td3.*register it.*--import"):
         Contents.read(path)
     path = _config(tmp_path / "config.json", memory="my-own-cell")
-    with pytest.raises(rtd.UserError, match="my-own-cell.*register what is your own"):
+    with pytest.raises(rtd.UserError, match="my-own-cell.*register it"):
         Contents.read(path)
 
 

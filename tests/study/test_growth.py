@@ -112,7 +112,7 @@ def test_what_is_there_already_is_not_trained_again(grown, capsys, monkeypatch):
     out, kept = grown
     monkeypatch.setattr(lanes, "_chunk", lambda *_: pytest.fail("trained again"))
     assert run(out, "h-td3", 1, 120) == 0
-    assert "holds more than was asked for: all of its 2 cells × 2 seeds go on" in (
+    assert "holds more cells or seeds than this command names: all of its 2 cells × 2 seeds" in (
         capsys.readouterr().out
     )
     assert contents(out) == kept["longer"][0]
@@ -140,7 +140,7 @@ def test_a_dry_run_says_what_would_be_added_and_writes_nothing(grown, capsys):
     assert run(out, "lstm-td3", 3, 120, "--dry-run", "--gamma", "0.5") == 0
     text = capsys.readouterr().out
     assert "3 cells × 3 seeds = 9 lanes" in text
-    assert "seed 2, 1 cell (rover ar1-slip lstm-td3 l=2; gamma 0.5 where it was 0.99)" in text
+    assert "seed 2, 1 cell (rover ar1-slip lstm-td3 l=2; gamma 0.5, before 0.99)" in text
     assert json.loads((out / "config.json").read_text()) == kept["longer"][1]
 
 
@@ -160,7 +160,7 @@ def _finish(directory, one, failure=None, checkpoint=None):
 def test_more_steps_that_cannot_go_on_are_refused_with_what_to_do(tmp_path):
     directory = _directory(tmp_path / "a")
     _finish(directory, cell())
-    with pytest.raises(rtd.UserError, match="1 of its lanes ended at 60 and kept no checkpoint"):
+    with pytest.raises(rtd.UserError, match="1 of its lanes ended at 60 without a checkpoint"):
         _directory(tmp_path / "a", cell(total_steps=90))
     directory.lanes.lane_path(cell(), 0).unlink()  # as the message says
     _directory(tmp_path / "a", cell(total_steps=90))

@@ -58,6 +58,6 @@ def test_cells_that_tables_could_not_tell_apart_are_refused(tmp_path):
         rtd.Study(both, out=tmp_path / "study")
     with pytest.raises(rtd.UserError, match="at least one cell"):
         rtd.Study([], out=tmp_path / "study")
-    with pytest.raises(rtd.UserError, match="made of rtd.Cell, not str"):
+    with pytest.raises(rtd.UserError, match="consists of rtd.Cell, not str"):
         rtd.Study(["rover"], out=tmp_path / "study")
     assert not (tmp_path / "study").exists()

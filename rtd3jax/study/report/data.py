@@ -1,7 +1,7 @@
-"""What the page shows of a run directory, as values that JSON has.
+"""The data of a run directory for its page, as JSON values.
 
-Numbers are rounded to five significant digits, and what is not finite is None. Whatever cannot be
-had is left out, and a note says why: a page of an unfinished run is a page all the same.
+Numbers are rounded to five significant digits; infinity and NaN become None. Data that are missing
+are left out, and a note gives the reason: the page can also show an unfinished run.
 """
 
 import dataclasses
@@ -34,7 +34,7 @@ from rtd3jax.study.statistics import Summary, iqm_bands, summarise
 from rtd3jax.study.status import ledger
 
 MOST_POINTS = 200
-"""Points of a learning curve that are drawn; of a longer one, as many, evenly spaced."""
+"""Maximum number of points of a learning curve; a longer curve is thinned evenly."""
 
 MEASURES = {"return": "as rewarded", "true_return": "of the true state"}
 
@@ -47,7 +47,7 @@ def study_data(
     lanes: pd.DataFrame,
     notes: list[str],
 ) -> dict[str, Any]:
-    """Everything but ceilings, transfer and playback; ``notes`` gains what is missing.
+    """All data except ceilings, transfer and playback; missing data add a line to ``notes``.
 
     ``lanes`` are the `seed_means` of ``episodes``.
     """
@@ -105,7 +105,7 @@ def study_data(
 def tables_of(
     directory: RunDirectory, notes: list[str]
 ) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
-    """Learning curves, final episodes and metrics; empty tables where there are none yet."""
+    """Learning curves, final episodes and metrics; empty tables if there are none yet."""
     tables = []
     for name, schema in (("curves", CURVES), ("episodes", EPISODES)):
         try:
@@ -116,7 +116,7 @@ def tables_of(
             tables.append(schema.empty_table().to_pandas())
     try:
         tables.append(read_table(directory.path / "metrics.parquet", METRICS))
-    except UserError:  # runs of before there were metrics have no such table
+    except UserError:  # runs of earlier versions have no metrics
         tables.append(METRICS.empty_table().to_pandas())
     return tables[0], tables[1], tables[2]
 
@@ -124,7 +124,7 @@ def tables_of(
 def _with_log(
     curves: pd.DataFrame, log: list[dict[str, Any]], directory: RunDirectory
 ) -> pd.DataFrame:
-    """The curves there are, and those of lanes under way, which only the log has."""
+    """The curves of ended lanes, and those of other lanes, which are only in the log."""
     key = [*CELL, "seed"]
     kept = set(curves[key].itertuples(index=False, name=None))
     study = {(*cell.key.values(), seed) for cell in directory.cells for seed in directory.seeds}
@@ -133,7 +133,7 @@ def _with_log(
         lane = lane_of(row)
         value = row.get("return")
         if lane in study and lane not in kept and isinstance(value, float | int):
-            # A lane that was trained again is logged again; the later row holds.
+            # A lane that was trained again is logged again; the last row is valid.
             point = {name: row[name] for name in (*key, "step")}
             rows[*lane, row["step"]] = {**point, "return": value, "true_return": math.nan}
     if not rows:
@@ -142,7 +142,7 @@ def _with_log(
 
 
 def _differs(curves: pd.DataFrame, episodes: pd.DataFrame) -> bool:
-    """Whether the reward that is given is anywhere not the true state's."""
+    """Whether any return differs from the return of the true state."""
     pairs = [table[["return", "true_return"]].dropna() for table in (curves, episodes)]
     return any(not np.allclose(pair["return"], pair["true_return"]) for pair in pairs)
 
@@ -158,7 +158,7 @@ def rows_of(table: pd.DataFrame, cell: Cell) -> pd.DataFrame:
 def _references(
     episodes: pd.DataFrame, env: str, disturbance: str, measures: list[str]
 ) -> list[dict[str, Any]]:
-    """Mean return of each policy that needs no training."""
+    """Mean return of each reference policy."""
     here = episodes[(episodes["env"] == env) & (episodes["disturbance"] == disturbance)]
     here = here[~is_trained(here)]
     found = []
@@ -169,7 +169,7 @@ def _references(
 
 
 def _curve(rows: pd.DataFrame, measure: str) -> dict[str, Any] | None:
-    """IQM over the seeds and the bounds of its interval, at each evaluation."""
+    """IQM over the seeds with the bounds of its interval, at each evaluation."""
     rows = rows[np.isfinite(rows[measure].astype(np.float64))]
     if rows.empty:
         return None
@@ -188,7 +188,7 @@ def _curve(rows: pd.DataFrame, measure: str) -> dict[str, Any] | None:
 
 
 def _learning(rows: pd.DataFrame) -> dict[str, Any]:
-    """The mean over the seeds of each metric, at each evaluation at which it was measured."""
+    """Mean of each metric over the seeds, at each evaluation with a measurement."""
     found = {}
     for metric, here in rows.dropna(subset="value").groupby("metric"):
         table = here.pivot(index="seed", columns="step", values="value")
@@ -204,7 +204,7 @@ def _learning(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def _final(lanes: pd.DataFrame, measure: str) -> dict[str, Any] | None:
-    """The final evaluation: a mean per seed, and their summary."""
+    """The final evaluation: the mean of each seed, and the summary of the means."""
     if lanes.empty:
         return None
     values = lanes[measure].to_numpy(np.float64)
@@ -228,7 +228,7 @@ def summary_data(summary: Summary) -> dict[str, Any]:
 
 
 def _study(cells: list[Cell], seeds: list[int], episodes: int) -> dict[str, Any]:
-    """Settings that all cells share, and the values of those in which they differ."""
+    """Common settings of all cells, and the values of settings that differ."""
     about = {field.name: field.metadata["help"] for field in dataclasses.fields(Config)}
     dicts = [cell.to_dict() for cell in cells]
     rows = []
@@ -247,10 +247,10 @@ def _ledger(directory: RunDirectory, notes: list[str]) -> list[dict[str, Any]]:
 
 
 def _timing(rows: list[dict[str, Any]], directory: RunDirectory) -> dict[str, Any] | None:
-    """What the log tells of time: a session's clock starts at zero.
+    """Times from the log; the clock starts at zero in each session.
 
-    Shards write one log at the same time, each with its own clock; their sum would be no one's
-    time, so it is left out.
+    If several shards write the log at the same time, each with its own clock, the sum of their
+    times has no meaning and is left out.
     """
     stamps = [row.get("seconds") for row in rows]
     if not rows or not all(isinstance(stamp, int | float) for stamp in stamps):

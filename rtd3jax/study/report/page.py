@@ -1,4 +1,4 @@
-"""The page as a file: data, drawing code and style in one HTML document."""
+"""Writes the page: data, code and style in one HTML document."""
 
 import datetime
 import html
@@ -43,17 +43,17 @@ def write_page(
     complete: bool = True,
     playback: bool = True,
 ) -> Path:
-    """Write the page of a run; its path.
+    """Write the page of a run; return its path.
 
     Args:
-        directory: the run.
-        path: of the page; ``report.html`` in the run directory by default.
-        complete: compute ceilings and play episodes where that was not done before. Without it
-            the page is cheap, and has those that are kept from before.
-        playback: whether the page has episodes at all.
+        directory: the run directory.
+        path: the path of the page; ``report.html`` in the run directory by default.
+        complete: whether to compute missing ceilings and play missing episodes. Without this, the
+            page only has those that are stored, and is written fast.
+        playback: whether the page has episodes.
 
     Raises:
-        UserError: when ``path`` holds something that is not a page of ours, or cannot be written.
+        UserError: when ``path`` is a file that is not such a page, or cannot be written.
     """
     path = directory.path / NAME if path is None else user_path(path)
     _check_ours(path)
@@ -66,7 +66,7 @@ def write_page(
 
 
 def refresh_page(directory: RunDirectory, *, complete: bool) -> None:
-    """Write the page if that can be done; a sweep goes on in any case."""
+    """Write the page; an error is printed, and the sweep continues."""
     try:
         write_page(directory, complete=complete)
     except Exception as error:
@@ -75,7 +75,7 @@ def refresh_page(directory: RunDirectory, *, complete: bool) -> None:
 
 
 def page_data(directory: RunDirectory, *, complete: bool, playback: bool) -> dict[str, Any]:
-    """All that the page's code draws."""
+    """The data of the page."""
     notes: list[str] = []
     curves, episodes, metrics = tables_of(directory, notes)
     lanes = seed_means(episodes)
@@ -99,7 +99,7 @@ def page_data(directory: RunDirectory, *, complete: bool, playback: bool) -> dic
 
 
 def render(data: dict[str, Any]) -> str:
-    """The document. Nothing in ``data`` is read as HTML or as code."""
+    """The HTML document; a browser reads nothing in ``data`` as HTML or as code."""
     parts = importlib.resources.files("rtd3jax.study.report") / "page"
     scripts = "\n".join((parts / f"{name}.js").read_text("utf-8") for name in _SCRIPTS)
     pieces = {
@@ -110,24 +110,24 @@ def render(data: dict[str, Any]) -> str:
         "SCRIPT": f"(() => {{\n'use strict';\n{scripts}\n}})();",
     }
     document = (parts / "page.html").read_text("utf-8")
-    # Cut first, then joined, so that a run's own text is never searched for our marks.
+    # The template is split first, so that marks in a run's own text are never replaced.
     found = document.split("@@")
     return "".join(pieces[part] if index % 2 else part for index, part in enumerate(found))
 
 
 def _json_in_html(data: object) -> str:
-    """JSON in which no character can end a script element."""
+    """JSON without characters that can end a script element."""
     text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     for character in "<>&\u2028\u2029":
         text = text.replace(character, f"\\u{ord(character):04x}")
-    # A file name may hold bytes that are no text.
+    # A file name may contain bytes that are not text.
     return text.encode("utf-8", "replace").decode()
 
 
 def _check_ours(path: Path) -> None:
-    """Refuse to overwrite what is not a page of ours."""
+    """Raise UserError if ``path`` is a file that is not such a page."""
     try:
         if os.path.lexists(path) and _GENERATOR not in path.read_text("utf-8", "replace")[:2000]:
-            raise UserError(f"{path} is not a page of rtd3jax; choose another --out")
+            raise UserError(f"{path} exists and is not a page of rtd3jax; choose another --out")
     except OSError as error:
         raise UserError(f"{path} cannot be written: {error.strerror}") from error

@@ -1,7 +1,7 @@
-"""Episodes of trained policies, step by step, small enough to travel inside the page.
+"""Records episodes of trained policies, step by step and compactly, for the page.
 
-Frame t is what followed from the t-th action: the observation that the agent saw next, the true one
-behind it, the action, its reward, and where the environment tells it what the action met unseen.
+Frame t is the result of action t: the next observation of the agent, the undisturbed observation,
+the action, the reward, and the hidden variable, if the environment provides it.
 """
 
 import base64
@@ -31,21 +31,21 @@ from rtd3jax.system.files import write_bytes_atomically
 FORMAT = 2
 EPISODES = 2
 SEED = 0
-"""Of the episodes, the same for all agents: in one environment they meet the same disturbance."""
+"""Seed of the episodes for all agents, so that they meet the same disturbances."""
 MOST_STEPS = 500
-"""Steps of an episode that are kept."""
+"""Maximum number of recorded steps of an episode."""
 MOST_CELLS = 60
-"""Cells with two episodes each; in a larger study each has one, so that the page stays small."""
+"""Up to this number of cells, each has two episodes; in a larger study, each has one."""
 
 
 def recordings(
     directory: RunDirectory, lanes: pd.DataFrame, *, record: bool, notes: list[str]
 ) -> list[dict[str, Any]]:
-    """A recording of every cell that has a trained policy, in the order of cells.
+    """A recording for each cell with a trained policy, in the order of the cells.
 
-    ``lanes`` are the `seed_means` of the final evaluation, by which the seed is chosen.
-    Kept in ``playback/`` beside the lanes, and made anew when the lane's file is another. Without
-    ``record``, only those that are kept.
+    ``lanes`` are the `seed_means` of the final evaluation, which determine the policy's seed.
+    The recordings are stored in ``playback/``, and made again when the lane's file changes. Without
+    ``record``, only stored recordings are returned.
     """
     count = EPISODES if len(directory.cells) <= MOST_CELLS else 1
     longest = max(cell.config.window_tokens for cell in directory.cells)
@@ -81,12 +81,12 @@ def record_episodes(
     steps: int,
     hidden: Callable[[Any], Any] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Play ``episodes`` of ``steps`` at most: arrays [episodes, steps, ...] by name.
+    """Play ``episodes`` of at most ``steps`` steps: arrays [episodes, steps, ...] by name.
 
-    ``hidden`` is that of the environment's `rtd3jax.envs.description.Drawing`.
+    ``hidden`` is the function in the environment's `rtd3jax.envs.description.Drawing`.
 
-    Episodes are those of ``evaluate(policy, env, episodes, seed)``. ``done`` says in which frame an
-    episode ended; later frames mean nothing.
+    The episodes are those of ``evaluate(policy, env, episodes, seed)``. ``done`` marks the frame in
+    which an episode ended; later frames have no meaning.
     """
     played = play_episodes(policy, env, episodes, seed, steps, hidden)
     frames = {
@@ -104,7 +104,7 @@ def _recorded(
 ) -> dict[str, Any]:
     env, policy = cell.make_env(), directory.lanes.policy(cell, seed)
     if policy.window_tokens:
-        # One window for all lengths, so that they share a program; a policy minds its own length.
+        # The same window for all lengths, so that they share a program; a policy keeps its length.
         policy = dataclasses.replace(policy, window_tokens=longest)
     limit = int(getattr(env.default_params, "max_steps_in_episode", DEFAULT_STEP_LIMIT))
     drawing = description_of(env, cell.env).drawing or Drawing()
@@ -113,7 +113,7 @@ def _recorded(
         frames = record_episodes(policy, env, count, SEED, steps, drawing.hidden)
     except UserError:
         raise
-    except Exception as error:  # a user's environment may do anything
+    except Exception as error:  # a user's environment may raise any error
         raise UserError(first_line(error)) from error
     cut = limit > MOST_STEPS and not frames["done"].any(axis=1).all()
     return {
@@ -124,12 +124,12 @@ def _recorded(
 
 
 def _scene(env: EnvironmentLike, drawing: Drawing, sizes: dict[str, int]) -> dict[str, Any]:
-    """What the page has to know: kind of scene, names of elements, and constants.
+    """Data of the page for drawing: the scene, the names of elements, and constants.
 
     Args:
-        env: the environment as it was made.
-        drawing: how it is drawn; what it does not name is numbered.
-        sizes: elements of each frame's arrays.
+        env: the environment with its disturbances.
+        drawing: the environment's drawing; elements without a name are numbered.
+        sizes: number of elements of each array of a frame.
     """
     params = env.default_params
     elements = seen_elements(env, params, sizes["true"])
@@ -143,7 +143,7 @@ def _scene(env: EnvironmentLike, drawing: Drawing, sizes: dict[str, int]) -> dic
     return {
         "kind": drawing.kind,
         "names": element_names(drawing.observation, "o", sizes["true"]),
-        # Which true element each seen one shows; None where that is not known.
+        # For each observed element, the index of the true element; None if it is not known.
         "elements": elements if len(elements) == sizes["seen"] else None,
         "actions": element_names(drawing.action, "a", sizes["action"]),
         "seconds": None if seconds is None else rounded_number(getattr(params, seconds)),
@@ -153,12 +153,12 @@ def _scene(env: EnvironmentLike, drawing: Drawing, sizes: dict[str, int]) -> dic
 
 
 def _packed(frames: dict[str, np.ndarray]) -> dict[str, Any]:
-    """One episode's frames up to its end: 16 bits a number, a scale for each element."""
+    """The frames of an episode up to its end, with 16 bits per number and a scale per element."""
     done = np.flatnonzero(frames.pop("done"))
     length = int(done[0]) + 1 if done.size else len(frames["reward"])
     packed: dict[str, Any] = {"steps": length}
     if np.array_equal(frames["seen"], frames["true"]):
-        frames.pop("seen")  # the agent sees the truth
+        frames.pop("seen")  # equal to the true observation
     for name, values in frames.items():
         values = values[:length].astype(np.float64)
         if not np.all(np.isfinite(values)):
@@ -173,7 +173,7 @@ def _packed(frames: dict[str, np.ndarray]) -> dict[str, Any]:
 
 
 def _middle_seed(directory: RunDirectory, cell: Cell, lanes: pd.DataFrame) -> int | None:
-    """The seed whose final return is the cell's median (the lower one of two): a typical agent."""
+    """A typical seed: its final return is the cell's median (the lower of two medians)."""
     rows = rows_of(lanes, cell)
     rows = rows[np.isfinite(rows["return"])].sort_values(["return", "seed"])
     seeds = [int(seed) for seed in rows["seed"] if directory.lanes.is_done(cell, int(seed))]
@@ -186,5 +186,5 @@ def _read(path: Path, stamp: dict[str, Any]) -> dict[str, Any] | None:
         if all(content[name] == value for name, value in stamp.items()) and content["runs"]:
             return content
     except (OSError, ValueError, KeyError, TypeError):
-        pass  # none, or another's
+        pass  # no recording, or an old one
     return None

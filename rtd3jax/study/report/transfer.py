@@ -1,4 +1,4 @@
-"""The transfer matrix: what an agent that was trained on one disturbance scores on another."""
+"""The transfer matrix: returns of trained agents under other disturbances."""
 
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ def transfer_data(path: Path) -> list[dict[str, Any]] | None:
     """A summary over the seeds for each agent, training and test; None without a table.
 
     Raises:
-        UserError: when ``path`` is there, but is not such a table.
+        UserError: when the file exists, but is not such a table.
     """
     if not path.is_file():
         return None
@@ -30,7 +30,7 @@ def transfer_data(path: Path) -> list[dict[str, Any]] | None:
         raise UserError(f"{path.name} cannot be read ({str(error).splitlines()[0]})") from error
     missing = [name for name in COLUMNS if name not in table.columns]
     if missing:
-        raise UserError(f"{path.name} lacks the columns {', '.join(missing)}")
+        raise UserError(f"{path.name} has no columns {', '.join(missing)}")
     table = table.astype({"return": np.float64})
     seeds = table.groupby([*_CELL, "seed"], sort=False)["return"]
     # As in `seed_means`: a lane with a NaN episode has no mean.
