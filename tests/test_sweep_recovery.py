@@ -132,7 +132,7 @@ def test_sigterm_leaves_checkpoints_and_the_rest_is_the_same(whole, tmp_path, mo
     with one_step_chunks(monkeypatch) as patch:
         patch.setattr(recorder.Recorder, "update", update)
         assert run(out) == 143
-    assert "the same command goes on" in capsys.readouterr().out
+    assert "repeat the command to train the lanes" in capsys.readouterr().out
     assert list(out.rglob("step-*.safetensors"))
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
     assert sweep.main(["--out", str(out), "--status"]) == 0

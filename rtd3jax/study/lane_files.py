@@ -147,6 +147,6 @@ class LaneFiles:
 
 def cell_name(cell: Cell) -> str:
     """The unique directory name of a cell."""
-    disturbance = cell.disturbance.replace("/", "~")  # "~" stands for "/", "-" for any other character
+    disturbance = cell.disturbance.replace("/", "~")  # "-" stands for any other character
     text = f"{cell.env}_{disturbance}_{cell.config.algorithm}_l{cell.config.history_length}"
     return re.sub(r"[^A-Za-z0-9._=+~-]", "-", text)

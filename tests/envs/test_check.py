@@ -208,8 +208,8 @@ class NoFinalObservation(Good):
 BROKEN = [
     (HalfPrecision, "dtype", "observation is bfloat16"),
     (WiderState, "dtype", r"state.time is float32\[\] after reset and int32\[\] after step"),
-    (OtherState, "dtype", "different kinds of structure"),
-    (OtherSpace, "space", r"shape \(3,\), the observation \(1,\)"),
+    (OtherState, "dtype", "of different structure"),
+    (OtherSpace, "space", r"shape \(3,\), but the observation has \(1,\)"),
     (Callback, "vmap", "vmap_method"),
     (NotFinite, "finite", "reward of step 3 is not finite"),
     (NotFiniteAtReset, "finite", "observation of reset"),
@@ -246,7 +246,7 @@ def test_every_kind_of_finding_has_a_broken_environment():
 
 def test_findings_name_their_kind():
     (finding,) = find_problems(TimeLimitTerminates())
-    assert finding.kind == "time-limit" and "bootstrapping" in finding.remedy
+    assert finding.kind == "time-limit" and "bootstrapped" in finding.remedy
     assert str(Finding("pure", "this", "that")) == "this; that"
 
 
@@ -303,7 +303,7 @@ def test_a_time_limit_of_one_step_is_a_warning(recwarn):
     )
     assert find_problems(Once()) == []
     recwarn.clear()
-    check_env(Bandit())  # nothing follows its end, and nothing is bootstrapped
+    check_env(Bandit())  # nothing follows its end, and no value is bootstrapped
     check_env(Good())
     assert not [w for w in recwarn if w.category is UserWarning]
 

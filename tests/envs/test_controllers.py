@@ -61,7 +61,7 @@ def branching(state, observation):
         (branching, "branching cannot be compiled: use jnp.where"),
         (lambda s, o: np.sin(np.asarray(o)[:1]), "cannot be compiled"),
         (lambda s, o: o[:1], r"must return \(action, state\), not "),
-        (lambda s, o: (o[:1], (s, s)), "must return a state of the shapes"),
+        (lambda s, o: (o[:1], (s, s)), "must return a state of the same shapes"),
         (lambda s, o: (o[:1], jnp.zeros(3)), r"same shapes as its argument: \(\), not \(3,\)"),
         (lambda s, o: (o[:2], s), r"action has shape \(2,\), the environment's \(1,\)"),
     ],
@@ -169,7 +169,7 @@ def test_the_regulator_holds_the_pendulum():
     [
         ("none", {"theta": 0.4}, {}, "needs an equilibrium: theta changes by"),
         ("hidden", {}, {}, "observation does not determine theta_dot"),
-        ("none", {}, {"q": [1.0, 1.0, 0.0]}, "give both q and r"),
+        ("none", {}, {"q": [1.0, 1.0, 0.0]}, "pass both q and r"),
         ("none", {}, {"q": [1.0, 1.0], "r": 1.0}, r"q must have shape \(3,\) or \(3, 3\)"),
         ("none", {}, {"q": [-1.0, 0.0, 0.0], "r": 1.0}, "a cost that is not negative"),
         ("none", {}, {"q": [1.0, 0.0, 0.0], "r": 0.0}, "a positive cost of the action"),

@@ -28,11 +28,11 @@ class NoDefaults:
 WRONG = {
     "gymnasium": (gymnasium.make("Pendulum-v1"), "is a Gymnasium environment.*run_in_gymnasium"),
     "name": ("pendulum", r"is a name, not an environment: .* rtd.make\('pendulum'\)"),
-    "tuple": (gymnax.make("Pendulum-v1"), r"gymnax.make returns \(env, params\); give env"),
+    "tuple": (gymnax.make("Pendulum-v1"), r"gymnax.make returns \(env, params\); pass env"),
     "class": (Rover, r"Rover is a class, .* Rover\(\)"),
     "brax": (Brax(), "wrap it by rtd.from_brax"),
     "nothing": (None, "NoneType has no method reset"),
-    "bare": (NoDefaults(), "no default_params.*give params="),
+    "bare": (NoDefaults(), "no default_params.*pass params="),
 }
 ENTRIES = {
     "check_env": rtd.check_env,

@@ -129,7 +129,7 @@ def test_mistakes_are_named(rover):
     for episode in (2, -1, True, 0.5):
         with pytest.raises(rtd.UserError, match="episode must be an integer from 0 to 1"):
             rtd.plot_episode(played, episode)
-    with pytest.raises(rtd.UserError, match="what rtd.rollout returns, not DataFrame"):
+    with pytest.raises(rtd.UserError, match="needs the result of rtd.rollout, not DataFrame"):
         rtd.plot_episode(played.to_frame())
     with pytest.raises(rtd.UserError, match="episodes must be an integer of at least 1, not 0"):
         rtd.rollout(rtd.bayes_policy(env), env, episodes=0)

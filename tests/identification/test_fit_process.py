@@ -113,12 +113,12 @@ def test_the_right_kind_explains_a_log_best():
     (log,) = logs_of(Ar1Slip(), 1, 8)
     fits = {kind: rtd.fit_process(log, kind) for kind in ("ar1", "sine", "ornstein-uhlenbeck")}
     assert min(fits, key=lambda kind: fits[kind].error) == "ar1"
-    assert "clipped and counts as a probability" in fits["ar1"].summary()
+    assert "clipped and contributes a probability" in fits["ar1"].summary()
     (log,) = logs_of(KNOWN["ornstein-uhlenbeck"][0], 1, 8)
     both = [rtd.fit_process(log, kind) for kind in ("ornstein-uhlenbeck", "noise")]
-    assert both[0].aic < both[1].aic and "GaussianNoise has none" in both[1].summary()
+    assert both[0].aic < both[1].aic and "GaussianNoise has zero mean" in both[1].summary()
     (log,) = logs_of(rtd.GaussianNoise(), 1, 8)
-    assert "GaussianNoise has none" not in rtd.fit_process(log, "noise").summary()
+    assert "GaussianNoise has zero mean" not in rtd.fit_process(log, "noise").summary()
 
 
 def test_likelihoods_against_slow_sums():
@@ -187,16 +187,16 @@ def test_what_the_picture_shows():
     ("log", "kind", "arguments", "match"),
     [
         (np.zeros((5, 1)), "noise", {}, "too few to fit"),
-        (np.ones((50, 2)), "noise", {}, "all values of the log are the same"),
+        (np.ones((50, 2)), "noise", {}, "all values of the log are equal"),
         (np.arange(50.0), "arima", {}, "kind 'arima' must be one of"),
-        (np.arange(50.0), "ar1", {}, "is of slip.*goes from 0 to 49"),
+        (np.arange(50.0), "ar1", {}, "needs slip.*goes from 0 to 49"),
         (np.arange(50.0) / 100, "ar1", {"max_slip": 0.3}, "less than the largest slip"),
         (np.arange(50.0) / 100, "ar1", {"max_slip": 3}, "at most 1"),
         (np.arange(50.0), "noise", {"max_slip": 0.5}, "max_slip is a parameter of ar1 and sine"),
         (np.arange(50.0), "ornstein-uhlenbeck", {}, "is not stationary"),
         (np.tile([0.0, 1.0], 30), "ornstein-uhlenbeck", {}, "has no memory, or alternates"),
         (np.repeat([0.0, 0.5], 30), "ar1", {}, "nearly all slip in the log is at a bound"),
-        (rtd.Recorded(np.arange(50.0)), "noise", {"step": 1}, "for the log that was read"),
+        (rtd.Recorded(np.arange(50.0)), "noise", {"step": 1}, "is for a log, not for a Recorded"),
         ([np.arange(6.0) / 10] * 5, "sine", {}, "no recording has 8 rows"),
         (np.full(50, np.nan), "noise", {}, "has no row with a number in every column"),
     ],

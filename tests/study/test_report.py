@@ -221,6 +221,6 @@ def test_transfer_names_what_does_not_fit(runs, capsys):
     run = str(runs["pendulum"])
     assert transfer.main([run, "--on", "hidden", "--episodes", "1"]) == 2
     captured = capsys.readouterr()
-    assert "3 observation elements" in captured.out and "nothing in" in captured.err
+    assert "3 observation elements" in captured.out and "no policy in" in captured.err
     assert transfer.main([run, "--on", "nose"]) == 2
     assert "did you mean 'noise'" in capsys.readouterr().err

@@ -105,7 +105,7 @@ def test_a_damaged_checkpoint_falls_back_to_the_older_one(stopped, whole, damage
 def test_no_silent_restart_when_every_checkpoint_is_damaged(stopped):
     for file in _newest(stopped):
         file.write_bytes(b"")
-    with pytest.raises(rtd.UserError, match="no older checkpoint is left"):
+    with pytest.raises(rtd.UserError, match="there is no older checkpoint"):
         _train(stopped)
 
 

@@ -27,7 +27,7 @@ def config(**changes):
         ({"actor_learning_rate": 0}, "actor_learning_rate is 0"),
         ({"critic_learning_rate": 0}, "critic_learning_rate is 0"),
         ({"tau": 0}, "tau is 0, so the target networks"),
-        ({"reward_scale": 0}, "no reward will be learnt from"),
+        ({"reward_scale": 0}, "all rewards in updates will be 0"),
     ],
 )
 def test_it_is_said(changes, match):

@@ -299,7 +299,7 @@ def test_names_are_joined_and_parameters_find_their_owner():
         (lambda: disturb(Echo(), GainDrift(gain_min=2.0)), "gain_min"),
         (lambda: disturb(Echo(), OrnsteinUhlenbeck(time_constant=0.0)), "time_constant"),
         (lambda: disturb(Echo(), Sum((Hidden(),))), "element 2"),
-        (lambda: disturb(Echo(), Sum((Hidden(element=0),))), "put it into a Chain"),
+        (lambda: disturb(Echo(), Sum((Hidden(element=0),))), "use a Chain"),
         (lambda: disturb(Echo(), Hidden(element=0), "action"), "not possible for the action"),
         (lambda: disturb(Echo(), Delay(), "actions"), "did you mean 'action'"),
         (lambda: disturb(Echo(), 3.0), "not a process"),

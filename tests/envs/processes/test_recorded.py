@@ -131,7 +131,7 @@ def test_a_split_shares_out_whole_recordings():
     for fraction in (0.0, 1.0, 2.0, True, "0.8"):
         with pytest.raises(UserError, match="fraction"):
             train.split(fraction)
-    with pytest.raises(UserError, match="1 rows cannot be cut"):
+    with pytest.raises(UserError, match="1 rows cannot be split"):
         rtd.Recorded([[1.0, 2.0]]).split(0.5)
 
 
