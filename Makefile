@@ -4,7 +4,7 @@ BIN := $(VENV)/bin
 
 .PHONY: help venv sweep bench docs lint format test test-slow clean
 
-help:  ## these lines
+help:  ## print this help
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/:/'
 
 $(VENV)/.installed: pyproject.toml constraints.txt
@@ -12,33 +12,33 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test,lint,docs]'
 	touch $@
 
-venv: $(VENV)/.installed  ## the environment, at the tested versions
+venv: $(VENV)/.installed  ## make the virtual environment with the tested versions
 
-sweep: venv  ## train td3, h-td3 and lstm-td3-1ha1hc on the slipping rover: the quick preset
+sweep: venv  ## train td3, h-td3 and lstm-td3-1ha1hc on the rover: the quick preset
 	$(BIN)/python -m rtd3jax.sweep --preset quick $(ARGS)
 
-bench: venv  ## how fast it is here, beside PyTorch: 20 minutes; the same command goes on
+bench: venv  ## measure the speed, compared with PyTorch: 20 minutes; repeat it to continue
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]' \
 		|| echo "PyTorch cannot be installed here"
 	$(BIN)/python -m experiments.benchmarks.bench $(ARGS)
 
-docs: venv  ## the documentation's site: build/site/index.html
+docs: venv  ## build the site: build/site/index.html
 	$(BIN)/mkdocs build --strict --quiet
 
-lint: venv  ## formatting, lint, types
+lint: venv  ## check formatting, lint and types
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
-format: venv  ## mend what ruff can mend
+format: venv  ## format, and fix what ruff can fix
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-test: lint  ## lint and the whole test suite
+test: lint  ## run lint and the whole test suite
 	$(BIN)/pytest -n 2 --dist worksteal
 
-test-slow: venv  ## the tests that are too slow for every change
+test-slow: venv  ## run the slow tests
 	$(BIN)/pytest -n 2 --dist worksteal -m slow
 
-clean:  ## remove what can be made again (never runs/)
+clean:  ## remove generated files (never runs/)
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis build *.egg-info

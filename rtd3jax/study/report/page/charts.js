@@ -1,4 +1,4 @@
-// Scales, axes, and the words that appear beside the pointer.
+// Scales, axes, and the text next to the pointer.
 
 function ticks(low, high, count) {
   const rough = (high - low) / Math.max(1, count);
@@ -11,8 +11,8 @@ function ticks(low, high, count) {
 
 const scale = (low, high, from, to) => (value) => from + ((value - low) / (high - low || 1)) * (to - from);
 
-// Limits around values, and which references lie near enough to have a line. One that is farther
-// away than the range of the values is named at the edge: its line would squash everything else.
+// Limits around values, and the references that are near enough for a line. A reference whose distance
+// exceeds the range of the values is named at the edge, because its line would compress the values.
 function limits(values, references) {
   let kept = values.filter(finite);
   if (!kept.length) kept = references.map((r) => r.value);
@@ -41,7 +41,7 @@ function referencesOf(environment, measure) {
 }
 const dashOf = (reference) => (reference.ceiling ? DASHES.ceiling : DASHES[reference.name]);
 
-// What lies beyond the axis is large: the axis' decimals would say nothing.
+// A value outside the axis is large, so the decimals of the axis are not needed.
 function farWords(reference, decimals) {
   const large = Math.abs(reference.value) >= 10;
   return `${reference.above ? '\u2191' : '\u2193'} ${reference.name} ${fixed(reference.value, large ? 0 : decimals)}`;
@@ -64,7 +64,7 @@ const tip = {
 
 const swatch = (agent) => el('span', { class: 'swatch', style: `color: var(--a${agent})`, 'aria-hidden': 'true' });
 
-// A plot's frame: gridlines and numbers. x counts environment steps, y is a return.
+// The frame of a plot: gridlines and numbers. x is environment steps, y is a return.
 function axes({ width, height, x, y, label }) {
   const marks = ticks(y[0], y[1], 4);
   const texts = marks.values.map((value) => fixed(value, marks.decimals));
@@ -86,7 +86,7 @@ function axes({ width, height, x, y, label }) {
   return { ...frame, svg };
 }
 
-// As many panels side by side as there is room for, each at least so wide.
+// As many panels in a row as fit, each with a minimum width.
 function panelGrid(body, panels, narrowest, make) {
   const columns = Math.max(1, Math.min(panels.length, Math.floor(body.clientWidth / narrowest)));
   const width = Math.floor((body.clientWidth - (columns - 1) * 26) / columns);

@@ -1,4 +1,4 @@
-// Learning curves: a panel for each disturbance and history length, a line with its band per agent.
+// Learning curves: a panel for each disturbance and history length, with a line and a band per agent.
 
 function curvePanels() {
   const panels = [];
@@ -8,8 +8,8 @@ function curvePanels() {
     const lengths = [...new Set(cells.map((cell) => cell.length))].filter(Boolean).sort((a, b) => a - b);
     const references = referencesOf(environment, state.measure);
     const curves = cells.map((cell) => cell.curves[state.measure]).filter(Boolean);
-    // One range for all lengths of an environment, so that its panels can be compared. Early returns may
-    // be a hundred times worse than late ones: the lowest tenth of a curve's points may be cut off.
+    // The same range for all lengths of an environment, so that its panels can be compared. Early returns
+    // may be a hundred times lower than late returns: the lowest tenth of a curve's points may be cut off.
     const lows = curves.flatMap((curve) => curve.low.map((low, k) => (finite(low) ? low : curve.iqm[k])));
     const floor = quantile(lows, 0.1);
     const kept = curves.flatMap((curve) => [...curve.low, ...curve.high, ...curve.iqm]).filter((value) => value >= floor);
@@ -33,13 +33,13 @@ function drawCurves() {
   const section = byId('curves');
   const panels = curvePanels();
   section.querySelector('.about').textContent =
-    'Evaluation during training against environment steps: interquartile mean over the seeds, with ' +
-    'the 95 % bootstrap interval of that mean as a band. Point at a curve, or focus a panel and use ' +
-    'the arrow keys, to read it.' + (panels.some(({ range }) => range.cut) ? ' Early returns far below the others are cut off.' : '');
+    'Evaluation returns over environment steps: the interquartile mean over the seeds, with ' +
+    'the 95 % bootstrap interval of this mean as a band. To read values, point at a curve, or focus a ' +
+    'panel and use the arrow keys.' + (panels.some(({ range }) => range.cut) ? ' Early returns that are far below the others are cut off.' : '');
   section.querySelector('.legend').replaceChildren(...legendItems(panels));
   const body = section.querySelector('.body');
   if (!panels.length) {
-    body.replaceChildren(el('p', { class: 'missing' }, 'Nothing is selected in the filter above.'));
+    body.replaceChildren(el('p', { class: 'missing' }, 'The filter above selects nothing.'));
     return;
   }
   panelGrid(body, panels, 330, curvePanel);

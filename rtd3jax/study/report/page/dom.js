@@ -1,4 +1,4 @@
-// Elements, text and numbers. All text goes in as text nodes: names of a run are never markup.
+// Elements, text and numbers. All text becomes text nodes, so names in a run are never markup.
 const DATA = JSON.parse(document.getElementById('data').textContent);
 const SVG = 'http://www.w3.org/2000/svg';
 
@@ -31,7 +31,7 @@ function fixed(value, decimals) {
   return (value < 0 && !zero ? MINUS : '') + text;
 }
 
-// Decimals that give the largest of some values four significant digits.
+// The decimals with which the largest value has four significant digits.
 function decimalsFor(values) {
   const largest = Math.max(0, ...values.filter(finite).map(Math.abs));
   if (largest === 0) return 2;

@@ -1,4 +1,4 @@
-// What is shown: sets of environments, agents and history lengths, shared by curves, returns and table.
+// The filter: sets of environments, agents and history lengths, for curves, returns and table.
 
 const state = { environments: new Set(), agents: new Set(), lengths: new Set(), measure: 'return' };
 
@@ -12,7 +12,7 @@ const cellName = (cell) =>
   DATA.agents[cell.agent].name + (cell.length ? `, ${lengthName(cell.length)}` : '');
 const allLengths = [...new Set(DATA.cells.map((cell) => cell.length))].filter(Boolean).sort((a, b) => a - b);
 
-// An agent without a window belongs beside every length.
+// An agent without a window is shown for every length.
 const isShown = (cell) =>
   state.environments.has(cell.environment) && state.agents.has(cell.agent) &&
   (cell.length === 0 || state.lengths.has(cell.length));
@@ -54,7 +54,7 @@ function measureChoice(update) {
 function startFilters(update) {
   DATA.agents.forEach((_, index) => state.agents.add(index));
   allLengths.forEach((length) => state.lengths.add(length));
-  // A large study opens on its first environments: some dozen panels.
+  // A large study first shows its first environments: about a dozen panels.
   const panels = Math.max(1, allLengths.length);
   const first = Math.max(1, Math.floor(12 / panels));
   DATA.environments.forEach((_, index) => { if (index < first) state.environments.add(index); });

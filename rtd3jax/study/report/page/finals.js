@@ -1,4 +1,4 @@
-// Final returns: for each disturbance a row per agent and length; dots are seeds.
+// Final returns: for each disturbance, a row per agent and length; dots are seeds.
 
 function drawFinals() {
   const section = byId('finals');
@@ -10,7 +10,7 @@ function drawFinals() {
     .map((environment, index) => ({ environment, cells: shownCells().filter((cell) => cell.environment === index && cell.final[state.measure]) }))
     .filter(({ cells }) => cells.length);
   if (!panels.length) {
-    body.replaceChildren(el('p', { class: 'missing' }, 'No lane of what is selected has ended yet.'));
+    body.replaceChildren(el('p', { class: 'missing' }, 'No selected lane has ended yet.'));
     return;
   }
   panelGrid(body, panels, 430, finalPanel);

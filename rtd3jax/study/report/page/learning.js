@@ -1,4 +1,4 @@
-// Metrics of learning, folded until they are asked for: a row of panels for each metric.
+// Metrics of learning, in a folded section: a row of panels for each metric.
 
 function learningPanels() {
   const panels = [];
@@ -26,11 +26,11 @@ function drawLearning() {
   if (section.hidden || !fold.open) return;
   const panels = learningPanels();
   section.querySelector('.about').textContent =
-    'What was measured while the agents learned, averaged between evaluations: the mean over the seeds. ' +
-    'Actions count as saturated beyond 0.99 of their half range; the exploration return is that of the training episodes.';
+    'Metrics of learning, averaged between evaluations: the mean over the seeds. ' +
+    'An action beyond 0.99 of its half range counts as saturated; the exploration return is the return of training episodes.';
   const body = section.querySelector('.body');
   if (panels.length) panelGrid(body, panels, 330, curvePanel);
-  else body.replaceChildren(el('p', { class: 'missing' }, 'Nothing is selected in the filter above.'));
+  else body.replaceChildren(el('p', { class: 'missing' }, 'The filter above selects nothing.'));
 }
 
 function startLearning() {

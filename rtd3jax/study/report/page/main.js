@@ -1,4 +1,4 @@
-// Puts the page together: colours, words about the study, and redrawing.
+// Builds the page: colours, texts about the study, and redrawing.
 
 function colours() {
   const rules = (name) => DATA.agents.map((agent, index) => `--a${index}: ${agent[name]};`).join(' ');
@@ -33,23 +33,23 @@ const pairs = (list) => el('table', { class: 'data wrap' }, el('tbody', {}, list
 
 function timing() {
   const time = DATA.timing;
-  if (!time) return el('p', { class: 'missing' }, 'The run has no log that tells.');
-  if (time.shards) return pairs([['environment steps', compact(time.steps)], ['shards', `${time.shards}, each with a clock of its own`]]);
-  return pairs([['environment steps', compact(time.steps)], ['in all', duration(time.seconds)],
+  if (!time) return el('p', { class: 'missing' }, 'The run has no log with times.');
+  if (time.shards) return pairs([['environment steps', compact(time.steps)], ['shards', `${time.shards}, each with its own clock`]]);
+  return pairs([['environment steps', compact(time.steps)], ['total time', duration(time.seconds)],
     ['sessions', String(time.sessions)], ['steps per second', time.steps_per_second ? compact(Math.round(time.steps_per_second)) : DASH]]);
 }
 
 function madeWith() {
   const { versions = {}, ...others } = DATA.made_with;
   const list = [...Object.entries(others), ...Object.entries(versions)].map(([name, value]) => [name, String(value)]);
-  return list.length ? pairs(list) : el('p', { class: 'missing' }, 'config.json does not tell.');
+  return list.length ? pairs(list) : el('p', { class: 'missing' }, 'config.json does not contain this.');
 }
 
 function troubles() {
   if (!DATA.troubles.length) return [];
   const rows = DATA.troubles.map((row) => [`${row.disturbance}, ${row.algorithm}, history ${row.history_length}, seed ${row.seed}`,
     `${row.status} at step ${row.step.toLocaleString('en')}${row.reason ? `: ${row.reason}` : ''}`]);
-  return [el('h3', {}, 'Lanes that are not done'), pairs(rows)];
+  return [el('h3', {}, 'Lanes that have not ended'), pairs(rows)];
 }
 
 function redraw() {
@@ -71,7 +71,7 @@ drawStudy();
 let settled = null;
 let width = document.documentElement.clientWidth;
 addEventListener('resize', () => {
-  // A phone's address bar changes the height alone.
+  // The address bar of a phone only changes the height.
   if (document.documentElement.clientWidth === width) return;
   width = document.documentElement.clientWidth;
   clearTimeout(settled);

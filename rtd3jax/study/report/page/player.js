@@ -1,4 +1,4 @@
-// Episode playback: the plant moves, and beneath it run the signals with a cursor at the frame.
+// Playback of episodes: an animated plant, and its signals with a cursor at the current frame.
 
 const player = { environment: 0, cells: [], run: 0, frame: 0, playing: false, speed: 1, stages: [], last: 0 };
 const FRAMES_PER_SECOND = 20;
@@ -24,13 +24,13 @@ function startPlayback() {
   const body = section.querySelector('.body');
   if (!DATA.playback.length) {
     about.textContent = DATA.complete
-      ? 'There is no trained policy to play yet.'
-      : 'Episodes are played when the sweep has ended; python -m rtd3jax.report RUN plays those of the agents that there are.';
+      ? 'No policy has been trained yet.'
+      : 'Episodes are recorded when the sweep has ended; python -m rtd3jax.report RUN records episodes of the agents that are trained.';
     body.replaceChildren();
     return;
   }
-  about.textContent = 'Trained policies (of the seed with the median return), two side by side; in one ' +
-    'environment all agents meet the same episodes. Space plays and stops, the arrow keys step.';
+  about.textContent = 'Two trained policies, each of the seed with the median return. All agents of an ' +
+    'environment meet the same episodes. Space starts and stops the playback; the arrow keys go to the next or previous frame.';
   const environments = [...new Set(DATA.playback.map((entry) => DATA.cells[entry.cell].environment))];
   player.environment = environments[0];
   const environmentSelect = selectOf('disturbance', environments.map((environment) => [environment, environmentName(DATA.environments[environment])]), (value) => {
@@ -38,7 +38,7 @@ function startPlayback() {
     chooseDefault();
     rebuild();
   });
-  const cellSelects = [0, 1].map((side) => selectOf(side ? 'beside' : 'agent', [], (value) => {
+  const cellSelects = [0, 1].map((side) => selectOf(side ? 'second agent' : 'agent', [], (value) => {
     player.cells[side] = value === '' ? null : Number(value);
     rebuild();
   }));
@@ -154,7 +154,7 @@ function makeStage(entry, index) {
 const noScene = (entry, run) => ({ svg: null, show() {}, readings: (t) => [['reward', fixed(run.reward[t][0], 3)]] });
 
 const SCENES = {
-  // Upright is up. The rod is the true state; the dot is where the observation says its end is.
+  // The upright position is up. The rod shows the true state; the dot shows the observed end of the rod.
   pendulum(entry, run, width) {
     const height = 210;
     const size = 78;
@@ -194,7 +194,7 @@ const SCENES = {
     };
   },
 
-  // From above, driving to the right; the step has no length of its own, so one is chosen here.
+  // View from above; the rover drives to the right. The step has no length in seconds, so one is assumed.
   rover(entry, run, width) {
     const step = 0.1;
     const { target_speed: speed, target_yaw_rate: turn, wheelbase } = entry.constants;
@@ -231,7 +231,7 @@ const SCENES = {
         body.setAttribute('transform', `translate(${x.toFixed(1)} ${y.toFixed(1)}) rotate(${((-heading * 180) / Math.PI).toFixed(2)})`);
         const [gx, gy] = place(wanted[t + 1]);
         fill(target, { cx: gx, cy: gy });
-        // A wheel that slips pales.
+        // The colour of a wheel becomes lighter with slip.
         wheels.forEach((node, side) => node.setAttribute('opacity', run.hidden ? Math.max(0.15, 1 - 2 * run.hidden[t][side]).toFixed(2) : 1));
       },
       readings: (t) => [
@@ -243,7 +243,7 @@ const SCENES = {
   },
 };
 
-// The signals beneath the scene: truth and observation, their difference, what is hidden, action.
+// The signals below the scene: true and observed values, their difference, the hidden variable, the action.
 function tracesOf(entry, run) {
   const column = (table, k) => table.map((row) => row[k]);
   const found = [];

@@ -1,8 +1,8 @@
-// The same numbers as a table that sorts.
+// The final returns as a table that can be sorted.
 
 const sorting = { column: null, descending: false };
 
-// How far from the uniform-random policy (0) to the ceiling (1) a return is.
+// A return on a scale from the uniform random policy (0) to the ceiling (1).
 function normalised(value, environment) {
   const references = referencesOf(environment, state.measure);
   const random = references.find((r) => r.name === 'random');
@@ -50,7 +50,7 @@ function tableRows() {
 function drawTable() {
   const section = byId('table');
   section.querySelector('.about').textContent =
-    'Final returns; a heading sorts. Normalised: 0 is the uniform-random policy, 1 is the ceiling, the best that any policy can reach.';
+    'Final returns; click a heading to sort. Normalised: 0 is the uniform random policy, 1 is the ceiling, the best possible return.';
   const rows = tableRows();
   const columns = tableColumns(decimalsFor(rows.map((row) => row.final && row.final.mean)));
   if (sorting.column !== null) {

@@ -1,15 +1,15 @@
-// The transfer matrix: an agent and what it was trained on in rows, what it was tested on in columns.
+// The transfer matrix: agents and their training disturbances in rows, test disturbances in columns.
 
 function drawTransfer() {
   const section = byId('transfer');
   const about = section.querySelector('.about');
   const body = section.querySelector('.body');
   if (!DATA.transfer || !DATA.transfer.length) {
-    about.textContent = 'Whether what was learned under one disturbance holds under another has not been tested for this run.';
-    body.replaceChildren(el('p', { class: 'missing' }, 'python -m rtd3jax.transfer RUN tests it and draws this matrix.'));
+    about.textContent = 'The agents of this run have not been tested under other disturbances yet.';
+    body.replaceChildren(el('p', { class: 'missing' }, 'python -m rtd3jax.transfer RUN tests them and draws this matrix.'));
     return;
   }
-  about.textContent = 'Mean return over seeds (± their standard deviation) of agents trained under one disturbance and tested under another. Darker is better, within a column.';
+  about.textContent = 'Mean return over seeds (± their standard deviation) of agents trained under one disturbance and tested under another. Within a column, darker is better.';
   const chosen = new Set([...state.agents].map((index) => DATA.agents[index].name));
   const blocks = [];
   for (const env of [...new Set(DATA.transfer.map((entry) => entry.env))]) {
