@@ -1,16 +1,16 @@
-"""How fast training is here: against PyTorch, against the machine, and agent against agent.
+"""Measures the speed of training: compared with PyTorch, with matrix products, and by agent.
 
 Usage: python -m experiments.benchmarks.bench [--quick] [--agents A ...] [--lengths L ...]
                                               [--repeats N] [--seconds S] [--out DIR] [--fresh]
 
 For every agent and window length, five seeds (batch 100, width 128) train on the rover under AR(1)
-slip with all cores: environment step, replay and both updates. Ours, PyTorch's two ways to share
-the cores, and large matrix products take turns, A B C A B C; every ratio is of neighbours in time.
-Afterwards: replay of a million rows against ten thousand, eight lanes against two, and compiling
-with and without JAX's persistent cache.
+slip with all cores: environment step, replay and all updates. rtd3jax, PyTorch with two ways to use
+the cores, and large matrix products are measured alternately, A B C A B C; each ratio is computed
+from measurements that follow each other. Then a replay of a million rows is compared with one of
+ten thousand, eight lanes with two, and compilation with and without JAX's persistent cache.
 
-Writes measurements.csv after every agent and length, then bench.md and bench.png, under --out. The
-same command again measures only what is missing there.
+The script writes measurements.csv after every agent and length, then bench.md and bench.png, to
+--out. If you repeat the command, it only measures what is missing.
 """
 
 import argparse
@@ -51,7 +51,7 @@ PRECISIONS = ("float32", "bfloat16")
 
 @dataclasses.dataclass(frozen=True)
 class Sizes:
-    """How large the work is; ``--quick`` has small ones."""
+    """Sizes of the measurements, which ``--quick`` reduces."""
 
     hidden_size: int = 128
     batch_size: int = 100
@@ -71,7 +71,7 @@ QUICK = Sizes(8, 10, 211, 64, 211, 211, lanes_length=1)
 
 
 class Measurements:
-    """The rows measured so far, on disk after every `add`.
+    """The measurements so far, which every `add` writes to disk.
 
     Columns: ``agent``, ``history_length``, ``measurement``, ``repeat``, ``value`` and ``machine``.
     """
@@ -85,16 +85,16 @@ class Measurements:
         if others:
             raise UserError(
                 f"{path} was measured on another machine ({others.pop()}); use --fresh, which "
-                "keeps it aside, or another --out"
+                "renames it, or another --out"
             )
 
     def has(self, agent: str, length: int, counts: dict[str, int]) -> bool:
-        """Whether every measurement was taken as often as ``counts`` says for this cell."""
+        """Whether this cell has the numbers of measurements that ``counts`` requires."""
         found = report.cell(self.table, agent, length).groupby("measurement").size()
         return all(found.get(name, 0) >= count for name, count in counts.items())
 
     def add(self, agent: str, length: int, values: list[tuple[str, int, float]]) -> None:
-        """Put the cell's rows in place of any that it had."""
+        """Replace the rows of the cell."""
         names = {name for name, _, _ in values}
         kept = self.table
         old = (kept["agent"] == agent) & (kept["history_length"] == length)
@@ -106,7 +106,7 @@ class Measurements:
 
 
 class Bench:
-    """What is to be measured, and with what."""
+    """The measurements, and the programs that take them."""
 
     def __init__(self, options: argparse.Namespace, torch: TorchProcesses | None):
         self.sizes = QUICK if options.quick else Sizes()
@@ -119,7 +119,7 @@ class Bench:
 
     @property
     def counts(self) -> dict[str, int]:
-        """How often each measurement of a cell is taken; compiling once."""
+        """Number of repeats of each measurement of a cell; compilation is measured once."""
         names = [report.ours(precision) for precision in self.precisions]
         names += [report.SGEMM, report.SGEMM_NUMPY]
         if self.torch is not None:
@@ -130,7 +130,7 @@ class Bench:
         }
 
     def config(self, agent: str, length: int, precision: str = "float32", **changes) -> rtd.Config:
-        """The agent at the bench's sizes."""
+        """The configuration of an agent with the sizes of the benchmark."""
         settings: dict[str, Any] = {
             "hidden_size": self.sizes.hidden_size,
             "batch_size": self.sizes.batch_size,
@@ -141,7 +141,7 @@ class Bench:
         return make_config(agent, length, **{**settings, **changes})
 
     def cell(self, agent: str, length: int) -> Iterator[tuple[str, int, float]]:
-        """All measurements of one agent at one length: name, repeat, value."""
+        """Yield all measurements of an agent and a length: name, repeat, value."""
         sides: dict[str, Callable[[], float]] = {}
         for precision in self.precisions:
             lanes = Lanes(self.config(agent, length, precision), SEEDS)
@@ -153,7 +153,7 @@ class Bench:
         yield from self._interleaved(sides)
 
     def replay_sizes(self) -> Iterator[tuple[str, int, float]]:
-        """A full large replay against a full small one, at length 1, where a step is shortest."""
+        """Compare a full large replay with a full small one, at length 1 with its short steps."""
         sides = {}
         for name, capacity in (
             (report.LARGE_REPLAY, self.sizes.large_replay),
@@ -167,7 +167,7 @@ class Bench:
         return self._interleaved(sides)
 
     def lane_counts(self) -> Iterator[tuple[str, int, float]]:
-        """Many lanes against few."""
+        """Compare many lanes with few lanes."""
         sides = {}
         for name, count in (
             (report.MANY_LANES, self.sizes.many_lanes),
@@ -211,7 +211,7 @@ class Bench:
 
 
 def compile_times(agent: str, length: int, repeats: int) -> Iterator[tuple[str, int, float]]:
-    """Compiling one program in a new process: without JAX's persistent cache, and from it."""
+    """Compilation of a program in a new process, without and with JAX's persistent cache."""
     with tempfile.TemporaryDirectory() as cache:
         _compile_in_new_process(agent, length, cache)
         for repeat in range(repeats):
@@ -248,7 +248,7 @@ def _quotient(done: tuple[float, float]) -> float:
 
 
 def _numpy_sgemm(size: int, seconds: float) -> tuple[float, float]:
-    """Operations done, and seconds: large products by numpy's BLAS, with its own threads."""
+    """Operations and seconds of large products by numpy's BLAS, with its own threads."""
     a = np.random.default_rng(0).standard_normal((size, size), np.float32)
     out = np.empty_like(a)
     np.matmul(a, a, out=out)
@@ -260,15 +260,15 @@ def _numpy_sgemm(size: int, seconds: float) -> tuple[float, float]:
 
 
 def machine() -> str:
-    """Processor and cores, by which results of different machines are kept apart.
+    """Processor and cores, which identify the machine of a result.
 
-    With the processor's family and model where there are any: a virtual machine's name hides them.
+    The processor's family and model are included, because the name in a virtual machine hides them.
     """
     try:
         lines = pathlib.Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
         lines = []
-    # The first processor's; the others are alike.
+    # The entries of the first processor; the others are equal.
     facts = {
         name.strip(): value.strip() for name, _, value in (x.partition(":") for x in lines[::-1])
     }
@@ -286,13 +286,13 @@ def _put_aside(path: pathlib.Path) -> None:
 
 
 def cells(agents: list[str], lengths: list[int]) -> list[tuple[str, int]]:
-    """Agent and length of all cells; td3 has no window and runs once."""
+    """Agent and length of all cells; td3 has no window, and so only one cell."""
     pairs = [(a, 0 if a == "td3" else length) for a in agents for length in lengths]
     return list(dict.fromkeys(pairs))
 
 
 def measure(options: argparse.Namespace, torch: TorchProcesses | None) -> pd.DataFrame:
-    """Fill in what is missing of the measurements; all of them."""
+    """Take the missing measurements; return all measurements."""
     bench = Bench(options, torch)
     done = Measurements(options.out / "measurements.csv", options.fresh, machine())
     todo = [
@@ -325,15 +325,15 @@ def _measure_extras(bench: Bench, done: Measurements, with_compiling: bool) -> N
 
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:
-    """The options, with what ``--quick`` changes."""
+    """The options, after the changes of ``--quick``."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="tiny and meaningless: does it run?")
+    parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
     parser.add_argument("--agents", nargs="+", choices=rtd.ALGORITHMS, metavar="AGENT")
     parser.add_argument("--lengths", nargs="+", type=int, metavar="L")
     parser.add_argument("--repeats", type=int, help="rounds of each comparison [3]")
-    parser.add_argument("--seconds", type=float, help="of each measurement [1.8]")
+    parser.add_argument("--seconds", type=float, help="duration of each measurement [1.8]")
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
-    parser.add_argument("--fresh", action="store_true", help="keep earlier measurements aside")
+    parser.add_argument("--fresh", action="store_true", help="rename earlier measurements")
     parser.add_argument("--no-torch", action="store_true", help="leave PyTorch out")
     options = parser.parse_args(arguments)
     quick = options.quick
@@ -344,7 +344,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     if min(options.lengths) < 1 or options.repeats < 1 or options.seconds <= 0:
         parser.error("--lengths, --repeats and --seconds must be positive")
     if quick and options.out == RESULTS:
-        parser.error("--quick measures nothing of worth: give it an --out of its own")
+        parser.error("the results of --quick have no meaning: choose another --out")
     return options
 
 
@@ -352,8 +352,8 @@ def main(arguments: list[str] | None = None) -> int:
     options = parse(arguments)
     with_torch = is_installed() and not options.no_torch
     if not with_torch:
-        why = "as asked" if options.no_torch else "it is not installed: pip install '.[bench]'"
-        print(f"PyTorch is left out, and its columns with it ({why})", flush=True)
+        why = "--no-torch" if options.no_torch else "it is not installed: pip install '.[bench]'"
+        print(f"PyTorch and its columns are left out ({why})", flush=True)
     try:
         if with_torch:
             with TorchProcesses(len(workers()), SEEDS) as torch:

@@ -1,13 +1,14 @@
-"""Which goals could be reached at all: a step of products, gates and optimisers, and nothing else.
+"""Bounds of the possible speed: a step that only has products, gates and optimisers.
 
 Usage: python -m experiments.benchmarks.bounds [--quick] [--lengths L ...] [--out DIR]
 
-For `lstm-td3-1ha1hc` at each length, per seed-step with all cores at work: the products of its
-updates, timed alone (experiments/benchmarks/products.py), the LSTM's gates, and Adam with the
-target averages, both as the profiler sees them (experiments/benchmarks/profile.py). Set against the
-rates of PyTorch and of large products that the benchmark measured on this machine, whose
-measurements.csv must stand in --out, they say what ratios would be left if acting, environment,
-replay, copies and XLA's runtime cost nothing. Writes bounds.md and bounds.csv.
+For `lstm-td3-1ha1hc` at each length, the script measures the parts of a seed-step on all cores: the
+products of the updates alone (experiments/benchmarks/products.py), and with the profiler the LSTM's
+gates and Adam with the target averages (experiments/benchmarks/profile.py). From these and from the
+rates of PyTorch and of large products, it computes the ratios that would result if acting,
+environment, replay, copies and XLA's runtime took no time. The rates are read from
+measurements.csv in --out, which the benchmark must have written on this machine. The script writes
+bounds.md and bounds.csv.
 """
 
 import argparse
@@ -50,12 +51,12 @@ def measure(length: int, sizes: Sizes) -> dict[str, float]:
 
 
 def beside(measured: report.Table, length: int) -> dict[str, float]:
-    """What the benchmark found at a length: PyTorch's ms, large products' rate, the ratios."""
+    """Results of the benchmark at a length: PyTorch's ms, rate of large products, ratios."""
     theirs, large = measured.torch(AGENT, length), measured.sgemm(AGENT, length)
     now, share = measured.against_torch(AGENT, length), measured.share(AGENT, length)
     if theirs is None or large is None or now is None or share is None:
         raise UserError(
-            f"{AGENT} at l = {length} has no measurements beside PyTorch in --out; run "
+            f"--out has no measurements of {AGENT} and PyTorch at l = {length}; run "
             "python -m experiments.benchmarks.bench first"
         )
     return {
@@ -67,7 +68,7 @@ def beside(measured: report.Table, length: int) -> dict[str, float]:
 
 
 def bound(parts: dict[str, float], found: dict[str, float], flops: float) -> dict[str, float]:
-    """The ratios that would be left if a step were its products, gates and optimisers alone."""
+    """The ratios of a step that only has products, gates and optimisers."""
     least = parts["products"] + parts["gates"] + parts["optimisers"]
     return {
         "ratio_bound": found["torch"] / least,
@@ -92,7 +93,7 @@ def markdown(table: pd.DataFrame) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="small, to see that it runs")
+    parser.add_argument("--quick", action="store_true", help="a small run to test the script")
     parser.add_argument("--lengths", type=int, nargs="+", default=list(LENGTHS))
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS / "benchmarks")
     options = parser.parse_args(arguments)

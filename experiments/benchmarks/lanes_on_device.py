@@ -1,12 +1,12 @@
-"""Seed-steps per second against the number of lanes side by side (``vmap``), on one device.
+"""Measures seed-steps per second for numbers of lanes in one program (``vmap``), on one device.
 
 Usage: python -m experiments.benchmarks.lanes_on_device [--quick] [--agent A] [--lengths L ...]
                                                         [--lanes N ...] [--seconds S] [--out FILE]
 
-For 1, 2, 4, ..., 1024 lanes: each length with a program of its own, then all lengths dealt over the
-lanes of one program whose windows are as long as the longest (what a sweep does on accelerators).
-Prints a Markdown table with the device's name. A number of lanes that does not fit ends
-its column.
+The numbers of lanes are 1, 2, 4, ..., 1024. First each length has its own program; then the lanes
+of one program have all lengths, with windows of the maximum length, as in a sweep on an
+accelerator. The script prints a Markdown table with the name of the device. A column ends at the
+number of lanes that does not fit in memory.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from rtd3jax.system.files import write_bytes_atomically
 
 
 def columns(options: argparse.Namespace) -> dict[str, tuple[list[rtd.Config], int | None]]:
-    """Title: the configurations dealt over the lanes, and the window that they share."""
+    """For each title, the configurations of the lanes and their common window."""
     sizes = {"hidden_size": options.hidden_size, "batch_size": options.batch_size}
     sizes["replay_capacity"] = 200 if options.quick else 10_000
     configs = [make_config(options.agent, length, **sizes) for length in options.lengths]
@@ -38,7 +38,7 @@ def columns(options: argparse.Namespace) -> dict[str, tuple[list[rtd.Config], in
 
 
 def rates(configs: list[rtd.Config], window: int | None, options) -> Iterator[float | None]:
-    """Seed-steps per second for each number of lanes; None from where memory ends."""
+    """Seed-steps per second for each number of lanes; None if the memory is too small."""
     fits = True
     for count in options.lanes:
         rate = None
@@ -86,14 +86,14 @@ def _cell(rate: float | None, first: float | None) -> str:
 
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:
-    """The options, with what ``--quick`` changes."""
+    """The options, after the changes of ``--quick``."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="tiny: two lanes")
     parser.add_argument("--agent", choices=rtd.ALGORITHMS, default="lstm-td3-1ha1hc")
     parser.add_argument("--lengths", nargs="+", type=int, metavar="L", help="[1 20]")
     parser.add_argument("--lanes", nargs="+", type=int, metavar="N", help="[1 2 4 ... 1024]")
-    parser.add_argument("--seconds", type=float, help="of each measurement [2]")
-    parser.add_argument("--out", type=pathlib.Path, help="write the table there too")
+    parser.add_argument("--seconds", type=float, help="duration of each measurement [2]")
+    parser.add_argument("--out", type=pathlib.Path, help="also write the table to this file")
     options = parser.parse_args(arguments)
     quick = options.quick
     options.lengths = options.lengths or ([1] if quick else [1, 20])

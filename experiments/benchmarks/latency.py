@@ -1,12 +1,12 @@
-"""Time of one control step of each exported form, one plant, one core.
+"""Measures the time of a control step for each export format, for one plant on one core.
 
 Usage: taskset -c 0 python experiments/benchmarks/latency.py [--quick] [--out DIR]
 
-Six agents at l = 10 and H = 128 with untrained weights, which cost what trained ones do, on the
-pendulum's observation; the recurrent ones also with a carry that runs on, whose cost does not
-depend on l. A repeat plays 200 steps and takes their median; the figure is the least
-median of all repeats, because a busy machine only ever adds to it. Observations come as numpy
-arrays and actions are waited for, as on a robot.
+The six agents have l = 10, H = 128, and untrained weights, which need the same time as trained
+ones, and read the pendulum's observation. Recurrent agents are also measured with a running carry,
+whose time does not depend on l. A repeat plays 200 steps and takes their median. The result is the
+minimum of all medians, because other work on the machine can only increase the time. Observations
+are numpy arrays, and each step waits for its action, as on a robot.
 """
 
 import argparse
@@ -19,7 +19,7 @@ import sys
 import tempfile
 import time
 
-# Before numpy and JAX are imported: one thread each.
+# Before the import of numpy and JAX: one thread each.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -125,7 +125,7 @@ def median_microseconds(step, observations):
 
 
 def measure(agents, length, width, repeats):
-    """Rows of agent, form and microseconds; forms and agents take turns through the repeats."""
+    """Rows of agent, format and microseconds; each repeat measures all of them in turn."""
     chance = np.random.default_rng(0)
     observations = chance.normal(size=(STEPS, OBSERVATIONS)).astype(np.float32)
     with tempfile.TemporaryDirectory() as name:
@@ -194,7 +194,7 @@ def _processor():
 def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="two agents, l = 2, H = 8")
-    parser.add_argument("--out", type=pathlib.Path, default=RESULTS, help="where latency.* go")
+    parser.add_argument("--out", type=pathlib.Path, default=RESULTS, help="directory of latency.*")
     options = parser.parse_args(arguments)
     length, width, repeats = (2, 8, 1) if options.quick else (10, 128, 100)
     agents = ("td3", "lstm-td3") if options.quick else rtd.ALGORITHMS

@@ -2,7 +2,7 @@
 
 Shapes: ``C`` capacity, ``B`` batch, ``L`` past tokens, ``O`` and ``A`` sizes of an observation and
 an action, ``H`` width. A token is a row (previous action | observation | action) of W = O + 2 A
-numbers, in this order, so that what any network reads of it is one slice.
+numbers, in this order, so that the inputs of any network are one slice.
 """
 
 from typing import NamedTuple
@@ -16,19 +16,19 @@ _WHEELBASE, _TARGET_SPEED, _MAX_SLIP, _RHO, _SIGMA = 0.5, 0.5, 0.5, 0.95, 0.05
 
 
 class Rover:
-    """What `rtd3jax.make("rover", "ar1-slip")` does, one step at a time, in Python's floats."""
+    """The environment `rtd3jax.make("rover", "ar1-slip")` in Python floats."""
 
     def __init__(self, random: np.random.Generator):
         self._random = random
 
     def reset(self) -> np.ndarray:
-        """Start at rest, with a slip drawn anew: the observation [2]."""
+        """Start at rest and draw the slip; return the observation [2]."""
         self._left, self._right = self._random.uniform(0.0, _MAX_SLIP, 2).tolist()
         self._time = 0
         return np.array([-_TARGET_SPEED, 0.0], np.float32)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool]:
-        """Observation [2], reward and whether the time is up; it never terminates."""
+        """Observation [2], reward, and whether the time limit is reached; it never terminates."""
         speed, yaw_rate = (min(max(a, ACTION_LOW), ACTION_HIGH) for a in action.tolist())
         turn = 0.5 * _WHEELBASE * yaw_rate
         left = (1.0 - self._left) * (speed - turn)
@@ -43,18 +43,18 @@ class Rover:
 
 
 class Window(NamedTuple):
-    """What a network may read at one step of each of B episodes, besides the current action."""
+    """The inputs of a network, except the current action, at one step of each of B episodes."""
 
     past: np.ndarray
     """[L, B, W], oldest first"""
     missing: np.ndarray
-    """[L + 1, B, 1], one where a past token does not exist; zero for the current token, the last"""
+    """[L + 1, B, 1], one for a past token that does not exist; zero for the last, current token"""
     current: np.ndarray
     """[B, A + O]: previous action and observation"""
 
 
 class Batch(NamedTuple):
-    """Sampled transitions; carries are [B, 2, H] (hidden, cell), for h-td3 only."""
+    """Sampled transitions; carries are [B, 2, H] (hidden, cell), only for h-td3."""
 
     window: Window
     action: np.ndarray
@@ -66,10 +66,10 @@ class Batch(NamedTuple):
 
 
 class Ring:
-    """A replay of C rows; row number n, an environment step's, stands in slot n % C.
+    """A replay of C rows; row number n, an environment step, is in slot n % C.
 
-    Carries have C + 1 slots: that of row n is also the next one of row n - 1, except at an
-    episode's start, whose slot serves the final observation of the episode before.
+    Carries have C + 1 slots: the carry of row n is also the next carry of row n - 1. At the start
+    of an episode, the slot holds the carry before the final observation of the previous episode.
     """
 
     def __init__(
@@ -100,14 +100,14 @@ class Ring:
         self._carries[number % (self._capacity + 1)] = carry
 
     def past(self, number: np.ndarray, episode_step: np.ndarray, length: int) -> tuple:
-        """Tokens [L, B, W] before the steps ``number`` [B], and how many of them exist [B]."""
+        """Tokens [L, B, W] before the steps ``number`` [B], and how many exist, [B]."""
         offsets = np.arange(-length, 0)[:, None]
         oldest = max(self.count - self._capacity, 0)
         exist = np.minimum(np.minimum(episode_step, number - oldest), length)
         return self._tokens.take((number + offsets) % self._capacity, axis=0), exist
 
     def sample(self, random: np.random.Generator, batch: int, length: int) -> Batch:
-        """Uniform draws, with replacement, from the rows kept."""
+        """A batch drawn uniformly, with replacement."""
         oldest = max(self.count - self._capacity, 0)
         return self.gather(random.integers(oldest, self.count, batch), length)
 
@@ -142,6 +142,6 @@ class Ring:
 
 
 def missing(exist: np.ndarray, length: int) -> np.ndarray:
-    """`Window.missing` where the last ``exist`` [B] of ``length`` past tokens exist."""
+    """`Window.missing` if the last ``exist`` [B] of ``length`` past tokens exist."""
     places = np.arange(length, -1, -1)[:, None]
     return (places > exist).astype(np.float32)[..., None] * (places > 0)[..., None]

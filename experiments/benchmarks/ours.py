@@ -1,4 +1,4 @@
-"""What rtd3jax takes: lanes of the sweep's own compiled program, on the sweep's own workers."""
+"""Measures rtd3jax: lanes of the compiled program of the sweep, on the workers of the sweep."""
 
 import contextlib
 import threading
@@ -14,13 +14,13 @@ import rtd3jax as rtd
 from rtd3jax.training import lanes
 from rtd3jax.training.run import make_jobs
 
-# A measurement ends with the chunks under way, and begins with some of unknown pace: both must be
-# short beside it. What short chunks cost counts against us.
+# A measurement ends after the running chunks, and begins with chunks of unknown speed: both must be
+# short compared with the measurement. The overhead of short chunks is included in the result.
 _CHUNK_SECONDS, _FIRST_CHUNK = 0.2, 1
 
 
 def make_config(algorithm: str, history_length: int, **settings: Any) -> rtd.Config:
-    """A configuration without evaluations within reach."""
+    """A configuration whose first evaluation is after the measurement."""
     numbers = {"total_steps": 100_000_000, "eval_every": 100_000_000, "replay_capacity": 30_000}
     length = None if algorithm == "td3" else history_length
     settings = {**numbers, **settings}
@@ -29,7 +29,7 @@ def make_config(algorithm: str, history_length: int, **settings: Any) -> rtd.Con
 
 
 class Lanes:
-    """Seeds of one configuration on the rover under AR(1) slip, to be run for a while at a time."""
+    """Seeds of one configuration on the rover under AR(1) slip, which run for given durations."""
 
     def __init__(
         self,
@@ -40,7 +40,7 @@ class Lanes:
         devices: int | None = None,
         window: int | None = None,
     ):
-        """``seeds`` lanes, dealt over the configurations in turn; ``window`` as in `make_jobs`."""
+        """``seeds`` lanes, with the configurations in turn; ``window`` is as in `make_jobs`."""
         configs = [config] if isinstance(config, rtd.Config) else config
         env = rtd.make("rover", "ar1-slip")
         jobs = [
@@ -51,13 +51,13 @@ class Lanes:
         self.groups = [_Clocked(group.jobs) for group in groups]
 
     def compile(self) -> float:
-        """Seconds until the first chunk's end: compiling, and milliseconds of random steps."""
+        """Seconds until the end of the first chunk: compilation, and few random steps."""
         began = time.perf_counter()
         self._until(lambda: True)
         return time.perf_counter() - began
 
     def warm_up(self, seconds: float) -> float:
-        """Compile, and run for a while with updates; the seconds of `compile`."""
+        """Compile, and run for ``seconds`` with updates; return the seconds of `compile`."""
         compiling = self.compile()
         while min(group.step for group in self.groups) <= self._learning_starts:
             self.run(seconds)
@@ -65,9 +65,9 @@ class Lanes:
         return compiling
 
     def run(self, seconds: float) -> tuple[int, float]:
-        """Seed-steps done, and seconds taken, in at least so many seconds.
+        """Run for at least ``seconds``; return the number of seed-steps and the time.
 
-        The seconds are the workers' mean: each has its own last chunk, and waits after it.
+        The time is the mean over the workers, each of which waits after its last chunk.
         """
         before = self._steps()
         for group in self.groups:
@@ -81,7 +81,7 @@ class Lanes:
         return self._steps() - before, float(np.mean(list(last.values()))) - began
 
     def program_text(self) -> str:
-        """The compiled program of the first group, as XLA prints it; it must have been compiled."""
+        """XLA's text of the compiled program of the first group; call `compile` first."""
         program = self.groups[0].jobs[0].program
         return next(
             entry.executables[1].as_text()
@@ -90,12 +90,12 @@ class Lanes:
         )
 
     def fill_replay(self, steps: int) -> None:
-        """As if ``steps`` steps had been done: random rows of 200-step episodes in every slot."""
+        """Fill the replay with random rows of 200-step episodes, as after ``steps`` steps."""
         random = np.random.default_rng(0)
         for group in self.groups:
             job = group.jobs[0]
             state = job.program.init(job.lane)
-            # A key is no array of numbers, and the age bounds the windows.
+            # A key is not an array of numbers, and the age limits the windows.
             rows = jax.tree.map(
                 lambda leaf: (
                     jnp.asarray(random.standard_normal(leaf.shape, np.float32))
@@ -116,7 +116,7 @@ class Lanes:
         return sum(group.step * len(group.jobs) for group in self.groups)
 
     def _until(self, enough: Any) -> None:
-        """Advance all groups until ``enough()`` after a chunk, and let what is under way end."""
+        """Advance all groups until ``enough()`` is true after a chunk; wait for running chunks."""
 
         def on_chunk(group: lanes.Group) -> None:
             if group.error is not None:
@@ -131,7 +131,7 @@ class Lanes:
 
 
 class _Clocked(lanes.Group):
-    """A group that knows when each worker last advanced it."""
+    """A group that records when each worker last advanced it."""
 
     ends: dict[int, float] = {}
 
@@ -142,7 +142,7 @@ class _Clocked(lanes.Group):
 
 
 class _Pause(Exception):
-    """Enough for now."""
+    """Raised to stop a measurement."""
 
 
 @contextlib.contextmanager
@@ -156,7 +156,7 @@ def _short_chunks() -> Iterator[None]:
 
 
 def sgemm(size: int, seconds: float) -> tuple[float, float]:
-    """Operations done, and seconds: large products, each on one core, as many as workers."""
+    """Operations and seconds of large products, one for each worker on its own core."""
     a = jnp.asarray(np.random.default_rng(0).standard_normal((size, size), np.float32))
     options = {"xla_cpu_multi_thread_eigen": False}
     product = jax.jit(jnp.matmul, compiler_options=options).lower(a, a).compile()

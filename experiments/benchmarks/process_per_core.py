@@ -1,11 +1,12 @@
-"""Do lanes train faster in a process per core than in the threads of one process?
+"""Compares a process per core with the threads of one process.
 
 Usage: python -m experiments.benchmarks.process_per_core [--quick] [--agent A] [--lengths L ...]
                                                          [--rounds N] [--seconds S] [--out DIR]
 
-A lane for each core, width 128, batch 100, on the rover: in one process, as the sweep has it, and
-in a process for each core, pinned to it. The two ways take turns; every ratio is of neighbours in
-time. Writes process_per_core.md, .parquet and .json.
+There is a lane for each core (width 128, batch 100, rover): in one process, as in the sweep, and in
+a process for each core, pinned to it. The two ways are measured alternately, and each ratio is
+computed from measurements that follow each other. The script writes process_per_core.md, .parquet
+and .json.
 """
 
 import argparse
@@ -41,7 +42,7 @@ for _ in sys.stdin:
 
 
 class Processes:
-    """Processes that train at the same time when they are asked to, and are idle otherwise."""
+    """Processes that train together during a measurement, and are idle otherwise."""
 
     def __init__(self, asked: list[str], shares: list[tuple[int, int]]):
         self._processes = [
@@ -57,7 +58,7 @@ class Processes:
         self._answers()
 
     def rate(self) -> float:
-        """Lane-steps per second of all of them together."""
+        """Lane-steps per second of all processes together."""
         for process in self._processes:
             assert process.stdin is not None
             process.stdin.write("\n")
@@ -65,7 +66,7 @@ class Processes:
         return sum(map(float, self._answers()))
 
     def end(self) -> None:
-        """Let them go."""
+        """End the processes."""
         for process in self._processes:
             assert process.stdin is not None
             process.stdin.close()
@@ -74,13 +75,13 @@ class Processes:
     def _answers(self) -> list[str]:
         lines = [process.stdout.readline() for process in self._processes if process.stdout]
         if not all(lines):
-            raise SystemExit("a process ended; its error stands above")
+            raise SystemExit("a process ended; see its error above")
         return lines
 
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="tiny and meaningless: does it run?")
+    parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
     parser.add_argument("--agent", default="lstm-td3-1ha1hc")
     parser.add_argument("--lengths", nargs="+", type=int, default=[1, 20])
     parser.add_argument("--rounds", type=int, default=9)

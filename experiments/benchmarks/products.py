@@ -1,14 +1,14 @@
-"""What bounds an update: its matrix products alone, each at its own shape, all cores busy.
+"""Measures the matrix products of an update alone, each with its own shape, on all cores.
 
 Usage: python -m experiments.benchmarks.products [--quick] [--lengths L ...] [--threads N]
                                                  [--out DIR]
 
-Times every product of an update of `lstm-td3-1ha1hc` (batch 100, width 128) by itself: compiled by
-XLA for one thread, as many threads at it as there are cores, repeated in one program, operands as
-warm as they get. Their sum is what an update would take if gates, activations, gathers, optimisers,
-acting and the environment cost nothing; beside it stand the step as it is, and the rate of a large
-product. A share of that rate above the one of the sum cannot be had with these products. Writes
-products.md.
+The script measures every product of an update of `lstm-td3-1ha1hc` (batch 100, width 128)
+separately. XLA compiles each for one thread, and as many threads as cores repeat it in one program,
+with operands in the cache. The sum of the times is the time of an update in which gates,
+activations, gathers, optimisers, acting and the environment take no time. The table compares it
+with the time of a step, and with the rate of a large product; no step with these products can have
+a larger share of this rate than the sum. The script writes products.md.
 """
 
 import argparse
@@ -36,7 +36,7 @@ SERIAL = {"xla_cpu_multi_thread_eigen": False}
 
 @dataclasses.dataclass(frozen=True)
 class Product:
-    """[m, k] times [k, n], ``count`` times an update; ``transposed``: the left factor is."""
+    """[m, k] times [k, n], ``count`` times per update; ``transposed`` is about the left factor."""
 
     name: str
     m: int
@@ -47,12 +47,12 @@ class Product:
 
     @property
     def flops(self) -> float:
-        """Operations of one."""
+        """Operations of one product."""
         return 2.0 * self.m * self.k * self.n
 
 
 def products_of(length: int, batch: int, width: int) -> list[Product]:
-    """The wide products of an update, the delayed ones spread over two steps."""
+    """The large products of an update; delayed updates count half."""
     rest, gates = length * batch, 4 * width
     # Forward: target actor, two target critics, two critics; actor and critic every second step.
     forward, backward = 5 + 1.0, 2 + 0.5
@@ -72,7 +72,7 @@ def products_of(length: int, batch: int, width: int) -> list[Product]:
 
 
 def seconds(product: Product, least: float, rounds: int, threads: int) -> float:
-    """Per product, of ``threads`` that are at it: the best of some rounds in a compiled loop."""
+    """Seconds per product with ``threads`` threads: the minimum over rounds of a loop."""
     random = np.random.default_rng(0)
     left = (product.k, product.m) if product.transposed else (product.m, product.k)
     x = jnp.asarray(random.standard_normal(left, np.float32))
@@ -80,7 +80,7 @@ def seconds(product: Product, least: float, rounds: int, threads: int) -> float:
 
     def repeat(x, y, times):
         def once(_, x):
-            # Barriers: the whole product, not the one element that is looked at.
+            # Barriers, so that XLA computes the whole product, not only the element that is read.
             factor = jax.lax.optimization_barrier(x)
             z = jax.lax.optimization_barrier((factor.T if product.transposed else factor) @ y)
             return x.at[0, 0].set(z[0, 0] * 1e-3)
@@ -108,7 +108,7 @@ def seconds(product: Product, least: float, rounds: int, threads: int) -> float:
 def step_seconds(
     length: int, batch: int, width: int, least: float, rounds: int, threads: int
 ) -> float:
-    """Per seed-step of a lane for each thread, in the sweep's own program: the best round."""
+    """Seconds per seed-step with a lane for each thread, in the sweep's program: the minimum."""
     lanes = Lanes(make_config(AGENT, length, batch_size=batch, hidden_size=width), threads)
     lanes.warm_up(least)
     found = []
@@ -161,7 +161,7 @@ def report(
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="small, to see that it runs")
+    parser.add_argument("--quick", action="store_true", help="a small run to test the script")
     parser.add_argument("--lengths", type=int, nargs="+", default=[1, 6, 20])
     parser.add_argument("--threads", type=int, default=len(workers()), help="[one per core]")
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS / "benchmarks")

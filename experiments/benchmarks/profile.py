@@ -1,10 +1,10 @@
-"""Where a step's time goes: the kernels of the sweep's own program, added up by their purpose.
+"""Measures the parts of a step: the times of the program's kernels, summed by their purpose.
 
 Usage: python -m experiments.benchmarks.profile [--quick] [--agent A] [--lengths L ...] [--out DIR]
 
-One lane per core trains on the rover (batch 100, width 128) while JAX's profiler watches. Each
-kernel's own time is counted to the purpose that its place in the source tells. Watching costs time
-too, mostly between kernels, so each table also has the step's time unwatched. Writes profile.md.
+One lane per core trains on the rover (batch 100, width 128) under JAX's profiler. The source
+location of a kernel determines its purpose. The profiler itself takes time, mostly between kernels,
+so each table also has the time of a step without it ("unwatched"). The script writes profile.md.
 """
 
 import argparse
@@ -41,7 +41,7 @@ def purposes(program_text: str) -> dict[str, str]:
             place, parent = frames[frame]
             file, function = places[place]
             yield files[file], functions[function]
-            frame = parent - 1  # counted from one, and zero is nobody
+            frame = parent - 1  # counted from one; zero means no parent
 
     found = {}
     pattern = r"^\s*(?:ROOT )?%?([\w.-]+) = .*?(?:op_name=\"([^\"]*)\".*?stack_frame_id=(\d+)|$)"
@@ -87,7 +87,7 @@ def _tables(text: str):
 
 
 def own_times(events: list[dict], purpose_of: dict[str, str]) -> collections.Counter:
-    """Microseconds of each purpose: of every event, less what is nested in it on its thread."""
+    """Microseconds of each purpose: each event's time without the events nested in it."""
     threads = collections.defaultdict(list)
     for event in events:
         if event.get("ph") == "X":
@@ -109,7 +109,7 @@ def own_times(events: list[dict], purpose_of: dict[str, str]) -> collections.Cou
 
 
 def watch(lanes: Lanes, least: float, watched: float) -> tuple[dict[str, float], float]:
-    """Microseconds of a core for a lane's step: of each purpose, and of a whole step unwatched."""
+    """Microseconds of a core per step: for each purpose, and for a step without the profiler."""
     lanes.warm_up(least)
     steps, took = lanes.run(least)
     unwatched = 1e6 * took * len(workers()) / steps
@@ -129,14 +129,14 @@ def report(lanes: Lanes, title: str, least: float, watched: float) -> str:
     total = sum(times.values())
     body = [[purpose, f"{time:.0f}", f"{time / total:.2f}"] for purpose, time in times.items()]
     body.append(["**together**", f"**{total:.0f}**", "**1.00**"])
-    # More than together: threads waited, or helped with a product, which leaves no event.
+    # More than the sum: threads waited, or helped with a product, for which there is no event.
     body.append(["a step unwatched", f"{unwatched:.0f}", ""])
     return f"## {title}\n\n{markdown_table(['purpose', 'µs of a core', 'share'], body)}\n"
 
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="small, to see that it runs")
+    parser.add_argument("--quick", action="store_true", help="a small run to test the script")
     parser.add_argument("--agent", choices=ALGORITHMS, default="lstm-td3-1ha1hc")
     parser.add_argument("--lengths", type=int, nargs="+", default=[1, 20])
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS / "benchmarks")

@@ -21,9 +21,9 @@ from rtd3jax.system.files import write_bytes_atomically
 COLUMNS = ["agent", "history_length", "measurement", "repeat", "value", "machine"]
 ONE_STREAM = "lstm-td3-1ha1hc"
 BASE = ("lstm-td3", 1)
-"""What the paper's figure of iteration times is relative to."""
+"""The cell with which the paper's figure compares iteration times."""
 
-# Names of measurements: rates in seed-steps/s, products in operations/s, compiling in s.
+# Names of measurements: rates in seed-steps/s, products in operations/s, compilation in s.
 SGEMM, SGEMM_NUMPY, SGEMM_TORCH = "sgemm, XLA", "sgemm, numpy", "sgemm, torch"
 LARGE_REPLAY, SMALL_REPLAY = "large replay", "small replay"
 MANY_LANES, FEW_LANES = "many lanes", "few lanes"
@@ -31,12 +31,12 @@ COLD, CACHED = "compile, new process", "compile, from cache"
 
 
 def ours(precision: str) -> str:
-    """The name of our rate."""
+    """The name of the rate of rtd3jax."""
     return f"rtd3jax {precision}"
 
 
 def compiling(precision: str) -> str:
-    """The name of our compile time."""
+    """The name of the compilation time of rtd3jax."""
     return f"compile {precision}"
 
 
@@ -59,32 +59,32 @@ class Spread:
 
 
 def spread(values: np.ndarray | None) -> Spread | None:
-    """Of repeats; None of none."""
+    """The spread of repeats; None without repeats."""
     if values is None or not len(values):
         return None
     return Spread(float(np.median(values)), float(np.min(values)), float(np.max(values)))
 
 
 class Table:
-    """Questions to the measurements; what was not measured is None."""
+    """Results from the measurements; None for missing measurements."""
 
     def __init__(self, measurements: pd.DataFrame, hidden_size: int, batch_size: int):
         self._rows, self._width, self._batch = measurements, hidden_size, batch_size
 
     def cells(self) -> list[tuple[str, int]]:
-        """Agent and length of what has a rate of ours, in the agents' order."""
+        """Agent and length of the cells with a rate of rtd3jax, in the order of the agents."""
         rows = self._rows[self._rows["measurement"] == ours("float32")]
         pairs = set(zip(rows["agent"], rows["history_length"].astype(int), strict=True))
         return sorted(pairs, key=lambda pair: (ALGORITHMS.index(pair[0]), pair[1]))
 
     def values(self, agent: str, length: int, name: str) -> np.ndarray | None:
-        """A measurement's repeats, in order."""
+        """The repeats of a measurement, in order."""
         rows = cell(self._rows, agent, length)
         rows = rows[rows["measurement"] == name].sort_values("repeat")
         return rows["value"].to_numpy(float) if len(rows) else None
 
     def torch(self, agent: str, length: int) -> tuple[str, np.ndarray] | None:
-        """The better of PyTorch's two ways, by its median, and its rates."""
+        """The better of PyTorch's two ways, by the median, and its rates."""
         found = [
             (way, values)
             for way in (ONE_PROCESS, PROCESS_PER_CORE)
@@ -93,17 +93,17 @@ class Table:
         return max(found, key=lambda pair: np.median(pair[1])) if found else None
 
     def against_torch(self, agent: str, length: int) -> np.ndarray | None:
-        """Our float32 rate over PyTorch's, round by round."""
+        """The float32 rate of rtd3jax divided by PyTorch's, for each round."""
         theirs = self.torch(agent, length)
         return _ratio(self.values(agent, length, ours("float32")), theirs and theirs[1])
 
     def bfloat16(self, agent: str, length: int) -> np.ndarray | None:
-        """The bfloat16 rate over float32's, round by round."""
+        """The bfloat16 rate divided by the float32 rate, for each round."""
         rates = [self.values(agent, length, ours(p)) for p in ("bfloat16", "float32")]
         return _ratio(*rates)
 
     def sgemm(self, agent: str, length: int) -> np.ndarray | None:
-        """Operations per second of large products beside this cell: the best way, by round."""
+        """Operations per second of large products with this cell: the fastest library, by round."""
         names = (SGEMM, SGEMM_NUMPY, SGEMM_TORCH)
         found = [v for name in names if (v := self.values(agent, length, name)) is not None]
         return max(found, key=np.median) if found else None
@@ -114,25 +114,25 @@ class Table:
         return update_flops(make_config(agent, length, **sizes))
 
     def share(self, agent: str, length: int) -> np.ndarray | None:
-        """The updates' operations per second over those of large products, round by round."""
+        """The updates' operations per second divided by those of large products, for each round."""
         rates = self.values(agent, length, ours("float32"))
         scaled = None if rates is None else rates * self.flops(agent, length)
         return _ratio(scaled, self.sgemm(agent, length))
 
     def relative_time(self, agent: str, length: int, base: tuple[str, int]) -> float | None:
-        """Median iteration time over the median of ``base``."""
+        """Median iteration time divided by the median of ``base``."""
         rates = [self.values(*pair, ours("float32")) for pair in (base, (agent, length))]
         if rates[0] is None or rates[1] is None:
             return None
         return float(np.median(rates[0]) / np.median(rates[1]))
 
     def pair(self, agent: str, length: int, first: str, second: str) -> np.ndarray | None:
-        """One measurement over another, round by round."""
+        """One measurement divided by another, for each round."""
         return _ratio(self.values(agent, length, first), self.values(agent, length, second))
 
 
 def _ratio(above: np.ndarray | None, below: np.ndarray | None) -> np.ndarray | None:
-    """Round by round, as far as both go."""
+    """The ratio for each round that both have."""
     if above is None or below is None:
         return None
     rounds = min(len(above), len(below))
@@ -141,7 +141,7 @@ def _ratio(above: np.ndarray | None, below: np.ndarray | None) -> np.ndarray | N
 
 @dataclasses.dataclass(frozen=True)
 class Goal:
-    """What was aimed at, and what was measured; ``at_least`` or else at most."""
+    """A goal and its measurement; the bound is a minimum if ``at_least``, else a maximum."""
 
     what: str
     bound: float
@@ -150,7 +150,7 @@ class Goal:
 
     @property
     def met(self) -> bool | None:
-        """None where it was not measured."""
+        """Whether the goal is reached; None without a measurement."""
         if self.value is None:
             return None
         return self.value >= self.bound if self.at_least else self.value <= self.bound
@@ -195,7 +195,7 @@ def markdown(measurements: pd.DataFrame, hidden_size: int, batch_size: int) -> s
         "iteration time ÷ lstm-td3, l = 1",
     )
     rows = [list(_row(table, *pair)) for pair in table.cells()]
-    # A column that nothing was measured for is left out.
+    # A column without measurements is left out.
     kept = [i for i in range(len(head)) if any(row[i] for row in rows)]
     lines = [
         "# Speed",
@@ -222,7 +222,7 @@ def markdown(measurements: pd.DataFrame, hidden_size: int, batch_size: int) -> s
 
 
 def _versions() -> str:
-    """Of what was raced."""
+    """Versions of the compared packages."""
     found = []
     for name in ("jax", "numpy", "torch"):
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
@@ -231,7 +231,7 @@ def _versions() -> str:
 
 
 def _row(table: Table, agent: str, length: int) -> Iterator[str]:
-    """A cell's columns; empty where there is nothing."""
+    """The columns of a cell; empty without measurements."""
 
     def show(values: np.ndarray | None, digits: int = 2) -> str:
         found = spread(values)
@@ -272,7 +272,7 @@ def _products(table: Table) -> list[str]:
 
 
 def _claim(table: Table) -> list[str]:
-    """The paper: h-td3 has the shortest iteration, and depends least on the window."""
+    """The paper's claim: h-td3 has the shortest iteration, and depends least on the window."""
     rates = {
         pair: float(np.median(values))
         for pair in table.cells()
@@ -304,7 +304,7 @@ def _line(cells: list[str]) -> str:
 
 
 def picture(measurements: pd.DataFrame, path: Path, hidden_size: int, batch_size: int) -> None:
-    """Against window length: iteration time, rate over PyTorch's, and share of sgemm."""
+    """Plot iteration time, rate divided by PyTorch's, and share of sgemm over window length."""
     table = Table(measurements, hidden_size, batch_size)
 
     def relative(agent: str, length: int) -> np.ndarray | None:
@@ -340,7 +340,7 @@ def picture(measurements: pd.DataFrame, path: Path, hidden_size: int, batch_size
 
 
 def _draw(axes, agent: str, points: list[tuple[int, Spread]], lengths: list[int]) -> None:
-    """An agent's line with its extremes; td3, which has no window, across all lengths."""
+    """Draw an agent's line with its extremes; td3 has no window, so its line spans all lengths."""
     x = [length for length, _ in points]
     shown = [s for _, s in points]
     dashes = "-"

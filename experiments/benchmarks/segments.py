@@ -1,13 +1,14 @@
-"""Segments against windows: whole training steps of one agent, taken in turns.
+"""Compares the speed of segments and windows: whole training steps of one agent.
 
 Usage: python -m experiments.benchmarks.segments [--quick] [--agent A] [--lengths L ...]
                                                  [--segment-lengths M ...] [--repeats N]
                                                  [--seconds S] [--batch-size B] [--torch]
                                                  [--out DIR]
 
-One lane per core trains on the rover under AR(1) slip: environment step, replay and both updates.
-Every ratio is of neighbours in time; the table has the median. With ``--torch`` PyTorch's windows
-take turns with ours, in a process per core. Writes segments.md, .parquet and .json under --out.
+One lane per core trains on the rover under AR(1) slip: environment step, replay and all updates.
+The variants are measured alternately, each ratio is computed from measurements that follow each
+other, and the table has the median. With ``--torch``, PyTorch's windows are measured too, in a
+process per core. The script writes segments.md, .parquet and .json to --out.
 """
 
 import argparse
@@ -74,7 +75,7 @@ def measure(options: argparse.Namespace, torch: TorchProcesses | None) -> pd.Dat
 
 
 def table(found: pd.DataFrame) -> str:
-    """Milliseconds and, in brackets, how many times faster than windows."""
+    """Milliseconds and, in brackets, the ratio of the windows' time to this time."""
     names = list(dict.fromkeys(found["way"]))
     body = []
     for length, rows in found.groupby("history_length", sort=False):
@@ -89,7 +90,7 @@ def table(found: pd.DataFrame) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="tiny and meaningless: does it run?")
+    parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
     parser.add_argument("--agent", choices=rtd.ALGORITHMS, default="lstm-td3-1ha1hc")
     parser.add_argument("--lengths", nargs="+", type=int, default=[1, 6, 10, 20])
     parser.add_argument("--segment-lengths", nargs="+", type=int, default=[5, 10, 20])
@@ -97,7 +98,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seconds", type=float, default=2.0)
     parser.add_argument("--batch-size", type=int, default=100)
     parser.add_argument("--width", type=int, default=128)
-    parser.add_argument("--torch", action="store_true", help="PyTorch's windows beside them")
+    parser.add_argument("--torch", action="store_true", help="also measure PyTorch's windows")
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
     options = parser.parse_args(arguments)
     if options.quick:

@@ -1,11 +1,11 @@
-"""How long until five seeds on the rover pass the paper's best return, all of them together?
+"""Measures the time until the mean of five seeds on the rover exceeds the paper's best return.
 
 Usage: python -m experiments.benchmarks.time_to_return [--quick] [--run DIR] [--out DIR]
 
-Trains `lstm-td3-1ha1hc` under AR(1) slip with the settings of `--preset quick`, in a new directory
-and without JAX's persistent cache: from the start of the process to the first evaluation at which
-the seeds' mean, of 20 episodes each, is above -1.36 and stays there. Writes time_to_return.md,
-.parquet and .json.
+The script trains `lstm-td3-1ha1hc` under AR(1) slip with the settings of `--preset quick`, in a new
+directory and without JAX's persistent cache. The time is from the start of the process to the first
+evaluation (20 episodes per seed) at which the mean over the seeds is above -1.36 and stays there.
+The script writes time_to_return.md, .parquet and .json.
 """
 
 import argparse
@@ -33,7 +33,7 @@ AGENT, PAPERS_BEST, SEEDS, EPISODES = "lstm-td3-1ha1hc", -1.36, 5, 20
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="tiny and meaningless: does it run?")
+    parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
     parser.add_argument("--run", type=pathlib.Path, default=pathlib.Path("runs/time_to_return"))
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
     options = parser.parse_args(arguments)
@@ -73,7 +73,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _text(first: pd.Series | None, before: float) -> str:
-    """Seconds since the process began: the log counts from the study's own start."""
+    """Seconds since the start of the process; the log counts from the start of the study."""
     return "never" if first is None else f"{before + float(first['seconds']):.0f}"
 
 

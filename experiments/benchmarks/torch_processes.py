@@ -1,4 +1,4 @@
-"""The PyTorch reference's processes, and the two ways in which they share the cores."""
+"""The processes of the PyTorch reference, and their two ways of using the cores."""
 
 import importlib.util
 import json
@@ -13,12 +13,12 @@ ONE_PROCESS, PROCESS_PER_CORE = "torch, one process", "torch, a process per core
 
 
 def is_installed() -> bool:
-    """Whether there is a PyTorch."""
+    """Whether PyTorch is installed."""
     return importlib.util.find_spec("torch") is not None
 
 
 class TorchProcesses:
-    """A process with all threads, and one process with one thread per core; idle unless asked."""
+    """A process with all threads, and a process with one thread for each core; usually idle."""
 
     def __init__(self, cores: int, seeds: int):
         self._seeds = list(range(seeds))
@@ -36,13 +36,13 @@ class TorchProcesses:
             process.wait()
 
     def prepare(self, **settings: Any) -> None:
-        """All seeds in the one process, and a share of them in each of the others."""
+        """Prepare all seeds in the one process, and a share of them in each of the others."""
         for processes in self._ways.values():
             shares = [self._seeds[rank :: len(processes)] for rank in range(len(processes))]
             _ask(processes, [{"do": "prepare", "seeds": share, **settings} for share in shares])
 
     def run(self, way: str, seconds: float) -> float:
-        """Seed-steps per second, all processes of the way at once."""
+        """Seed-steps per second of all processes of the way together."""
         return self._rate(way, {"do": "run", "seconds": seconds})
 
     def sgemm(self, way: str, size: int, seconds: float) -> float:
@@ -77,5 +77,5 @@ def _ask(processes: list, orders: list[dict]) -> list[dict]:
         process.stdin.flush()
     lines = [process.stdout.readline() for process in processes]
     if not all(lines):
-        raise RuntimeError("a process of the PyTorch reference ended; its error stands above")
+        raise RuntimeError("a process of the PyTorch reference ended; see its error above")
     return [json.loads(line) for line in lines]

@@ -1,6 +1,6 @@
-"""The six agents in PyTorch: the same work per update as rtd3jax's, written to be fast.
+"""The six agents in PyTorch, with the same work per update as in rtd3jax, written to be fast.
 
-What makes it fast: `torch.nn.LSTM` over whole windows, no tape where nothing is differentiated
+It is fast because of `torch.nn.LSTM` over whole windows, no tape for values without gradients
 (targets, and the critic's past tokens in the actor's loss), fused Adam, one fused call for all
 Polyak averages, one gather per window. Shapes are those of `numpy_environment`.
 """
@@ -25,9 +25,9 @@ Carry = tuple[torch.Tensor, torch.Tensor]
 class Network(nn.Module):
     """Encoder, memory, head, as `rtd3jax.agents.networks`.
 
-    The LSTM has one input more than the encoder has outputs: a flag that shuts the input gate of
-    missing tokens. They stand before all others, so that the carry stays zero through them; the
-    flag's weights get no gradient, because a shut gate passes none.
+    The LSTM has one more input than the encoder has outputs: a flag that closes the input gate of
+    missing tokens. These are before all other tokens, so the carry stays zero. The weights of the
+    flag get no gradient, because a closed gate passes none.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Network(nn.Module):
     def forward(
         self, window: Window, action: torch.Tensor | None = None, carry: Carry | None = None
     ) -> torch.Tensor:
-        """[B, outputs]; with ``carry`` the past tokens are not read."""
+        """The output [B, outputs]; with ``carry``, the past tokens are not read."""
         features = []
         if self.spec.memory:
             features.append(self._memory(window, action, carry))
@@ -95,7 +95,7 @@ class Network(nn.Module):
         return self.lstm(torch.cat((encoded, absent), -1), carry)[1]
 
     def _token(self, parts: tuple[str, ...], window: Window, action) -> torch.Tensor:
-        """The current token's ``parts``, in a row's order."""
+        """The ``parts`` of the current token, in the order of a row."""
         split = self.sizes["previous_action"]
         if "previous_action" in parts:
             return window.current
@@ -104,7 +104,7 @@ class Network(nn.Module):
 
 
 class Learner:
-    """Networks, targets and optimisers of one seed; `rtd3jax.agents.learners.td3`'s updates."""
+    """Networks, targets and optimisers of one seed, with the updates of rtd3jax's TD3."""
 
     def __init__(
         self,
@@ -139,7 +139,7 @@ class Learner:
 
     @torch.no_grad()
     def target(self, batch: Batch, gaussian: torch.Tensor) -> torch.Tensor:
-        """y [B], with ``gaussian`` [B, A] for the smoothing noise."""
+        """The targets y [B], with ``gaussian`` [B, A] for the smoothing noise."""
         noise = (self._noise * gaussian).clamp_(-self._clip, self._clip)
         action = self.act(self.target_actor, batch.next_window).add_(noise)
         action.clamp_(-1.0, 1.0)
@@ -151,7 +151,7 @@ class Learner:
         return batch.reward + bootstrap
 
     def update_critics(self, batch: Batch, gaussian: torch.Tensor) -> torch.Tensor:
-        """One step of both critics; the loss []."""
+        """One step of both critics; returns the loss []."""
         y = self.target(batch, gaussian)
         loss = sum(
             functional.mse_loss(critic(batch.window, batch.action, batch.carry)[:, 0], y)
@@ -161,7 +161,7 @@ class Learner:
         return loss.detach()
 
     def update_actor_and_targets(self, batch: Batch) -> None:
-        """One step of the actor, then all targets."""
+        """One step of the actor, then of all targets."""
         carry = batch.carry
         critic = self.critics[0]
         if carry is None and self.variant.critic.memory:
@@ -180,7 +180,7 @@ class Learner:
 
 
 def tensors(batch: Batch) -> Batch:
-    """The batch as tensors over the same memory; carries as the LSTM takes them."""
+    """The batch as tensors over the same memory, with carries for the LSTM."""
     return Batch(
         window=window_tensors(batch.window),
         action=torch.from_numpy(batch.action),

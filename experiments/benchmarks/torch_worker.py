@@ -1,4 +1,4 @@
-"""A process that trains seeds of the PyTorch reference for the benchmark: it obeys lines of JSON.
+"""A process that trains seeds of the PyTorch reference, and reads commands as lines of JSON.
 
 Usage: python -m experiments.benchmarks.torch_worker THREADS, then on the standard input
 
@@ -6,7 +6,7 @@ Usage: python -m experiments.benchmarks.torch_worker THREADS, then on the standa
     {"do": "run", "seconds": ...}    steps of all seeds in turn, for so long
     {"do": "sgemm", "size": ..., "seconds": ...}
 
-Each is answered by a line of JSON: steps (or operations) done, and seconds.
+The answer to each is a line of JSON: the number of steps or operations, and the seconds.
 """
 
 import json
@@ -35,7 +35,7 @@ from experiments.benchmarks.torch_reference import (
 from rtd3jax.registries import AGENTS
 
 _TURN = 8
-"""Steps of a seed before it is the next one's turn: its weights stay in the cache meanwhile."""
+"""Steps of a seed before the next seed, during which its weights stay in the cache."""
 
 
 class Seed:
@@ -139,10 +139,10 @@ class Seed:
 
 
 class Worker:
-    """The process's seeds."""
+    """The seeds of the process."""
 
     def prepare(self, seeds: list[int], warm_up: int, learning_starts: int, **settings) -> dict:
-        """Make the seeds and take each past its first updates."""
+        """Create the seeds, and run each until after its first updates."""
         self._seeds = [
             Seed(seed=seed, learning_starts=learning_starts, **settings) for seed in seeds
         ]
@@ -152,7 +152,7 @@ class Worker:
         return {"seeds": len(self._seeds)}
 
     def run(self, seconds: float) -> dict:
-        """Steps of the seeds in turn until the time is up."""
+        """Run steps of the seeds in turn for ``seconds``."""
         steps, began = 0, time.perf_counter()
         while True:
             for seed in self._seeds:
@@ -164,7 +164,7 @@ class Worker:
                         return {"steps": steps, "seconds": passed}
 
     def sgemm(self, size: int, seconds: float) -> dict:
-        """Operations of large float32 products."""
+        """Operations and seconds of large float32 products."""
         a, b = torch.randn(size, size), torch.randn(size, size)
         out = a @ b
         products, began = 0, time.perf_counter()
