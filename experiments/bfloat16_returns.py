@@ -1,12 +1,13 @@
-"""Do returns suffer from bfloat16 products? A paired comparison on the rover.
+"""Compares returns with bfloat16 and float32 products, in pairs of seeds on the rover.
 
 Usage: python experiments/bfloat16_returns.py [--quick] [--run DIR] [--float32 DIR] [--out DIR]
 
-Trains `lstm-td3-1ha1hc` under AR(1) slip with experiments/rover.py's setting, five seeds, in both
-precisions: a pair shares its initial parameters, its plant's slip and its exploration noise, and is
-tested on the same 1,000 episodes. ``--float32`` takes that side from a run of experiments/rover.py.
-Writes bfloat16_returns.md and .parquet: a row per seed, and the mean difference with its 95%
-interval (Student's t over the five differences). The same command goes on with what is missing.
+The script trains `lstm-td3-1ha1hc` under AR(1) slip with the settings of experiments/rover.py and
+five seeds in both precisions. The two trainings of a pair have the same initial parameters, the
+same slip and the same exploration noise, and are tested in the same 1,000 episodes. ``--float32``
+names a run of experiments/rover.py for the float32 side. The script writes bfloat16_returns.md and
+.parquet: a row per seed, and the mean difference with its 95% interval (Student's t over the five
+differences). If you repeat the command, it only trains what is missing.
 """
 
 import argparse
@@ -29,7 +30,7 @@ AGENT, DISTURBANCE = "lstm-td3-1ha1hc", "ar1-slip"
 
 
 def train(run: pathlib.Path, precision: str, seeds: range, tiny: dict[str, object]) -> list[str]:
-    """Train what is missing; a line for each lane that was lost."""
+    """Train the missing lanes; return a line for each lane that was lost."""
     settings = {**ROVER_SETTINGS, "precision": precision, "total_steps": ROVER_STEPS, **tiny}
     config = rtd.Config(AGENT, ROVER_HISTORY_LENGTH, **settings)
     study = rtd.Study([rtd.Cell("rover", DISTURBANCE, config)], seeds=seeds, out=run)
@@ -47,7 +48,7 @@ def evaluate(run: pathlib.Path, seeds: range, episodes: int) -> list[float]:
 
 
 def interval(differences: np.ndarray) -> tuple[float, float, float]:
-    """Mean difference of pairs and its 95% interval."""
+    """The mean difference of pairs and its 95% interval."""
     mean, error = float(differences.mean()), float(stats.sem(differences))
     reach = float(stats.t.ppf(0.975, len(differences) - 1)) * error
     return mean, mean - reach, mean + reach
@@ -55,7 +56,7 @@ def interval(differences: np.ndarray) -> tuple[float, float, float]:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
+    parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
     parser.add_argument("--run", type=pathlib.Path, default=pathlib.Path("runs/bfloat16"))
     parser.add_argument("--float32", type=pathlib.Path, help="a run of experiments/rover.py")
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS / "benchmarks")

@@ -1,19 +1,21 @@
-"""The paper's fifteen claims, each tested on whatever results are there.
+"""Tests the paper's fifteen claims with the available results.
 
 Usage: python experiments/claims.py [--results DIR] [--out DIR]
 
-An effect is a difference of means over seeds with a 95% bootstrap interval (seeds resampled within
-each side, 10,000 times, fixed random numbers). The margin of equivalence is 0.02 of a normalised
-return, stated before the runs; on the rover 2% of the paper's best return.
+An effect is a difference of means over seeds with a 95% bootstrap interval (seeds are resampled on
+each side, 10,000 times, with fixed random numbers). The margin of equivalence is 0.02 of a
+normalised return, which was fixed before the runs; on the rover it is 2% of the paper's best
+return.
 
-A claim that something helps is *supported* where the interval lies above zero, *contradicted* where
-it lies below, and finds *no effect* where it has zero in it and lies within the margin. A claim of
-no effect is supported where the interval lies within the margin, and contradicted where it lies
-beyond. Otherwise the verdict is *undecided*: too few seeds, or an interval that is too wide. A
-claim of several comparisons is as its worst one.
+A claim of a positive effect is *supported* if the interval lies above zero, and *contradicted* if
+it lies below zero. The verdict is *no effect* if the interval contains zero and lies within the
+margin. A claim of no effect is supported if the interval lies within the margin, and contradicted
+if it lies outside the margin. Otherwise the verdict is *undecided*: there are too few seeds, or the
+interval is too wide. A claim with several comparisons has the verdict of the worst comparison.
 
-Rover: returns. Pendulum: normalised returns, of the current setting alone. Iteration time: rounds
-of the benchmark in place of seeds. Writes claims.md and .parquet.
+The values are returns for the rover, and normalised returns of the current settings for the
+pendulum. For iteration times, rounds of the benchmark replace seeds. The script writes claims.md
+and .parquet.
 """
 
 import argparse
@@ -46,7 +48,7 @@ NO_EFFECT = "no effect"
 
 @dataclasses.dataclass(frozen=True)
 class Effect:
-    """A difference that a claim says is positive: its name, the two sides' values by seed."""
+    """A difference that should be positive by a claim: its name, and both sides' values by seed."""
 
     name: str
     better: np.ndarray
@@ -54,7 +56,7 @@ class Effect:
     margin: float = MARGIN
 
     def interval(self) -> tuple[float, float, float]:
-        """The difference of means, and its bootstrap interval."""
+        """The difference of means and its bootstrap interval."""
         random = np.random.default_rng(0)
         means = [
             side[random.integers(0, len(side), (RESAMPLES, len(side)))].mean(axis=1)
@@ -73,7 +75,7 @@ class Effect:
         return NO_EFFECT if max(-low, high) <= self.margin else UNDECIDED
 
     def text(self) -> str:
-        """The numbers, for the table."""
+        """The numbers of the effect, for the table."""
         if min(len(self.better), len(self.worse)) < FEWEST_SEEDS:
             return f"{self.name}: too few seeds ({len(self.better)}, {len(self.worse)})"
         mean, low, high = self.interval()
@@ -82,7 +84,7 @@ class Effect:
 
 
 def combine(verdicts: list[str]) -> str:
-    """A claim of several comparisons is as its worst one; undecided without any."""
+    """The verdict of a claim with several comparisons: the worst one; undecided without any."""
     for verdict in (CONTRADICTED, UNDECIDED, NO_EFFECT):
         if verdict in verdicts:
             return verdict
@@ -91,10 +93,10 @@ def combine(verdicts: list[str]) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Equal(Effect):
-    """A difference that a claim says is none: within the margin."""
+    """A difference that should be zero by a claim: within the margin."""
 
     def verdict(self) -> str:
-        """Supported where the interval lies within the margin, contradicted where outside it."""
+        """Supported if the interval lies within the margin, contradicted if it lies outside."""
         if min(len(self.better), len(self.worse)) < FEWEST_SEEDS:
             return UNDECIDED
         _, low, high = self.interval()
@@ -105,7 +107,7 @@ class Equal(Effect):
 
 @dataclasses.dataclass(frozen=True)
 class Results:
-    """All that there is: tables of the experiments, empty ones where they were not run."""
+    """The tables of the experiments; empty tables for experiments that were not run."""
 
     rover: pd.DataFrame
     pendulum: pd.DataFrame
@@ -114,7 +116,7 @@ class Results:
 
     @classmethod
     def read(cls, directory: pathlib.Path) -> "Results":
-        """From the directory of results."""
+        """Read the directory of results."""
         files = [directory / f"{name}.parquet" for name in ("rover", "pendulum", "generalisation")]
         tables = [pd.read_parquet(file) if file.exists() else pd.DataFrame() for file in files]
         tables[1:] = [current(table) for table in tables[1:]]
@@ -129,21 +131,21 @@ class Results:
     def on_pendulum(
         self, algorithm: str, disturbance: str, length: int | None = None
     ) -> np.ndarray:
-        """Normalised return of each seed: of one window length, or the mean over those run."""
+        """Normalised return of each seed, for one window length or as a mean over all lengths."""
         key: dict = {"algorithm": algorithm, "disturbance": disturbance}
         if length is not None and algorithm != "td3":
             key["history_length"] = length
         return _by_seed(self.pendulum, key, "normalised")
 
     def lengths(self) -> list[int]:
-        """Window lengths run on the pendulum."""
+        """Window lengths in the results of the pendulum."""
         if self.pendulum.empty:
             return []
         found = self.pendulum["history_length"]
         return sorted(int(length) for length in found[found > 0].unique())
 
     def carried(self, algorithm: str, tested: str) -> np.ndarray:
-        """Normalised return of each seed of an agent of `random-sine` under another condition."""
+        """Normalised returns, by seed, of an agent of `random-sine` under another condition."""
         key = {"algorithm": algorithm, "tested_on": tested}
         return _by_seed(self.generalisation, key, "normalised")
 
@@ -154,9 +156,9 @@ class Results:
 
 
 def current(table: pd.DataFrame) -> pd.DataFrame:
-    """The rows of the current setting, and of each agent's full size.
+    """The rows with the current settings and the full size of each agent.
 
-    Trainings of another setting, width or length are not compared with them.
+    Trainings with other settings, another width or another length are left out.
     """
     if table.empty:
         return table
@@ -184,7 +186,7 @@ def history_is_nothing(disturbance: str) -> Callable[[Results], list[Effect]]:
 
 
 def equal(effects: list[Effect]) -> list[Effect]:
-    """The same differences, of which the claim says that there are none."""
+    """The same differences, which should be zero by the claim."""
     return [Equal(effect.name, effect.better, effect.worse) for effect in effects]
 
 
@@ -199,7 +201,7 @@ def history_helps(results: Results, disturbance: str) -> list[Effect]:
 def length_helps(results: Results, disturbance: str) -> list[Effect]:
     """The longest window over the shortest."""
     lengths = results.lengths()
-    if len(lengths) < 2:  # a comparison that is missing leaves the claim undecided
+    if len(lengths) < 2:  # without a comparison, the claim is undecided
         return [Effect("lstm-td3, longest over shortest window", np.empty(0), np.empty(0))]
     long, short = (results.on_pendulum("lstm-td3", disturbance, lengths[k]) for k in (-1, 0))
     return [Effect(f"lstm-td3, l={lengths[-1]} over l={lengths[0]}", long, short)]
@@ -211,7 +213,7 @@ def temporal_sine(results: Results) -> list[Effect]:
 
 
 def noise(results: Results) -> list[Effect]:
-    """Claim 5; that returns sag late in training is left to the curves."""
+    """Claim 5, without the fall of returns late in training, which the curves show."""
     found = history_helps(results, "noise") + length_helps(results, "noise")
     sigmas = ("noise", HARD_NOISE)
     small, large = (results.on_pendulum("lstm-td3", name) for name in sigmas)
@@ -260,7 +262,7 @@ def stored_carries(results: Results) -> list[Effect]:
 
 
 def iteration_time(results: Results) -> list[Effect]:
-    """Claim 10: steps a second at every length, and what a long window leaves of them."""
+    """Claim 10: the rate at every length, and the share of the rate at the longest window."""
     found, lengths = [], (1, 3, 6, 10, 20)
     for agent in LSTM_AGENTS:
         found += [
@@ -292,7 +294,7 @@ def carries_over(results: Results) -> list[Effect]:
 
 
 def on_the_rover(name: str, better: np.ndarray, worse: np.ndarray) -> Effect:
-    """An effect in the rover's returns, which are not normalised."""
+    """An effect on the rover's returns, which are not normalised."""
     return Effect(name, better, worse, ROVER_MARGIN)
 
 
@@ -325,7 +327,7 @@ def best_transfer(results: Results) -> list[Effect]:
 
 
 def slip_variants(results: Results) -> list[Effect]:
-    """Claim 15: of the three variants high variance is the worst and fast slip the best."""
+    """Claim 15: of the three variants, high variance is the worst, and fast slip is the best."""
     effects = []
     for a in rtd.ALGORITHMS:
         high, fast, slow = (
@@ -363,7 +365,7 @@ CLAIMS: tuple[tuple[int, str, Callable[[Results], list[Effect]]], ...] = (
 
 
 def judge(results: Results) -> pd.DataFrame:
-    """A row per claim: number, claim, verdict, a summary, and the effects line by line."""
+    """A row per claim: number, claim, verdict, a summary, and a line for each effect."""
     rows = []
     for number, claim, effects_of in CLAIMS:
         effects = effects_of(results)
@@ -387,7 +389,7 @@ def judge(results: Results) -> pd.DataFrame:
 
 
 def markdown(table: pd.DataFrame) -> str:
-    """A line per claim, and its comparisons folded below."""
+    """A line per claim, and a folded list of its comparisons."""
     lines = markdown_table(
         ["", "the paper's claim", "verdict", "comparisons: difference of means [95% interval]"],
         [[str(row.claim), row.text, row.verdict, row.summary] for row in table.itertuples()],

@@ -1,10 +1,10 @@
-"""How well a Bayes filter that knows the disturbance plays the pendulum: a lower bound of the best.
+"""Evaluates a Bayes filter that knows the disturbance: a lower bound of the optimal return.
 
 Usage: python experiments/filter_reference.py [--quick] [--out DIR]
 
-Plays 1,000 episodes of `rtd.filter_policy` per disturbance. The normalised return is that of the
-other tables: 0 is the uniform-random policy, 1 is the ceiling. Writes filter_reference.md, .parquet
-and .json.
+The script plays 1,000 episodes of `rtd.filter_policy` for each disturbance. The normalised return
+is as in the other tables: 0 is the uniform random policy, 1 is the ceiling. The script writes
+filter_reference.md, .parquet and .json.
 """
 
 import argparse
@@ -31,11 +31,11 @@ DISTURBANCES = (
     "noise:sigma=1.0",
 )
 EPISODES, SEED = 1_000, 1
-# Not 0, on whose episodes the filter's process noise was chosen.
+# Not 0: the filter's process noise was chosen on the episodes of seed 0.
 
 
 def row(name: str, episodes: int, ceiling: float) -> dict[str, object]:
-    """What the filter earns under a disturbance."""
+    """The returns of the filter under a disturbance."""
     disturbance, parameters = parse_disturbance(name)
     env = rtd.make("pendulum", disturbance, **parameters)
     policy = rtd.filter_policy(env)

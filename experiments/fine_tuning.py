@@ -1,12 +1,13 @@
-"""A rover's agent that was trained on sine slip goes on in AR(1) slip for 5,000 steps.
+"""Continues the training of a rover's agent from sine slip under AR(1) slip, for 5,000 steps.
 
 Usage: python experiments/fine_tuning.py [--quick] [--run DIR] [--seeds N] [--out DIR]
 
-Trains `lstm-td3-1ha1hc` on sine slip with the setting of the preset `rover` and keeps its
-checkpoints; then goes on from them under AR(1) slip, with the actor alone and with critics and
-optimisers. Beside them: no further training, and new weights for as many steps. Five seeds, 1,000
-episodes each. Writes fine_tuning.md, .parquet and .json; the same command goes on with what is
-missing.
+The script trains `lstm-td3-1ha1hc` on sine slip with the settings of the preset `rover` and keeps
+the checkpoints. Training then continues under AR(1) slip, from the actor alone, and from the actor
+with critics and optimisers. For comparison, there are agents without further training, and agents
+with new weights for the same number of steps. There are five seeds, and 1,000 episodes for each
+test. The script writes fine_tuning.md, .parquet and .json. If you repeat the command, it only
+trains what is missing.
 """
 
 import argparse
@@ -26,18 +27,18 @@ from writing import RESULTS, markdown_table, provenance, write_results  # noqa: 
 AGENT, FIRST, THEN, EPISODES, SEEDS = "lstm-td3-1ha1hc", "sine-slip", "ar1-slip", 1_000, 5
 STEPS, ACTOR_STARTS = 5_000, 2_000
 LEARNING_RATE = 1e-3
-"""Of critics and actor while they go on: a third of the first training's."""
+"""Learning rate of critics and actor in the second training: a third of the first rate."""
 
 
 def study(run: pathlib.Path, disturbance: str, seeds: int, fields: dict[str, Any]) -> rtd.Study:
-    """A cell of the agent."""
+    """A study with a cell of the agent."""
     config = rtd.Config(AGENT, ROVER_HISTORY_LENGTH, **{**ROVER_SETTINGS, **fields})
     return rtd.Study([rtd.Cell("rover", disturbance, config)], seeds=range(seeds), out=run)
 
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
+    parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
     parser.add_argument("--run", type=pathlib.Path, default=pathlib.Path("runs/fine_tuning"))
     parser.add_argument("--seeds", type=int, default=SEEDS)
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
@@ -75,7 +76,7 @@ def main(arguments: list[str] | None = None) -> int:
             policy = rtd.load_policy(own.path, seed=seed)
             returns = rtd.evaluate(policy, env, episodes, seed=seed)
             rows.append({"way": name, "seed": seed, "mean": float(np.mean(returns))})
-    for seed in range(options.seeds):  # the actor alone, from a saved policy of its own
+    for seed in range(options.seeds):  # the actor alone, from its saved policy
         path = policies / f"seed-{seed}.safetensors"
         rtd.load_policy(source.path, seed=seed).save(path, overwrite=True)
         config = rtd.Config(AGENT, ROVER_HISTORY_LENGTH, **{**ROVER_SETTINGS, **then, **waits})

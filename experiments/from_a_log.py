@@ -1,4 +1,4 @@
-"""From wheel speeds in a CSV file to a policy that is trained, tested and exported.
+"""Trains, tests and exports a policy from wheel speeds in a CSV file.
 
 Usage: python experiments/from_a_log.py [LOG.csv] [--quick] [--out DIR]; see docs/from_a_log.md.
 """
@@ -17,22 +17,24 @@ from rtd3jax.study.presets import PRESETS
 
 
 def drive(out: Path, episodes: int) -> Path:
-    """Log the wheel speeds, in m/s, of a rover that is to drive straight on."""
+    """Write a log of the wheel speeds, in m/s, of a rover that should drive straight ahead."""
     rover = Rover(RoverParams(slip=Ar1Slip(rho=0.97, sigma=0.06)))
     log = rtd.rollout(rtd.constant_policy([0.5, 0.0]), rover, episodes=episodes, seed=7)
     speed, turn = log.true[:, 1:].reshape(-1, 2).T * [[1.0], [0.25]] + [[0.5], [0.0]]
     frame = pd.DataFrame({"episode": np.repeat(np.arange(episodes), 200)})
     for side, realised in (("left", speed - turn), ("right", speed + turn)):
         frame[f"commanded_{side}"], frame[f"realised_{side}"] = 0.5, realised
-    frame.loc[300:309, "realised_left"] = np.nan  # an encoder without a signal for 10 steps
+    frame.loc[300:309, "realised_left"] = np.nan  # an encoder loses its signal for 10 steps
     frame.to_csv(out / "log.csv", index=False, float_format="%.7f")
     return out / "log.csv"
 
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("log", nargs="?", type=Path, help="by default a rover is driven")
-    parser.add_argument("--quick", action="store_true", help="too short to learn anything")
+    parser.add_argument(
+        "log", nargs="?", type=Path, help="wheel speeds; by default a rover is simulated"
+    )
+    parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
     parser.add_argument("--out", type=Path, default=Path("runs/from_a_log"))
     (options := parser.parse_args(arguments)).out.mkdir(parents=True, exist_ok=True)
     speeds = pd.read_csv(options.log or drive(options.out, 10 if options.quick else 50))

@@ -1,14 +1,14 @@
-"""Agents trained on simulators behind Gymnasium: returns, and what a call to the host costs.
+"""Trains agents on Gymnasium's simulators: returns, and the time of a call to the host.
 
 Usage: python experiments/gymnasium_simulators.py [--quick] [--tasks T ...] [--out DIR]
 
-`pendulum`: Gymnasium's Pendulum-v1 and our own pendulum, `td3`, five seeds each with the same
-setting; the difference of their means with its 95% interval (Welch). `inverted`: MuJoCo's
-InvertedPendulum-v5 with its velocities hidden, `lstm-td3-1ha1hc` and `td3`, three seeds, 30,000
-steps. `cheetah`: HalfCheetah-v5 with its velocities hidden, one seed of each, 100,000 steps.
-`cost`: milliseconds of a step of `td3` on Pendulum-v1, less those of the simulator alone and of the
-same agent on our own pendulum. Writes gymnasium_simulators.md, .parquet and .json; rows that are
-there are kept.
+`pendulum`: `td3` on Gymnasium's Pendulum-v1 and on the pendulum of this package, with five seeds
+each and the same settings; the difference of the means has a 95% interval (Welch). `inverted`:
+`lstm-td3-1ha1hc` and `td3` on MuJoCo's InvertedPendulum-v5 with hidden velocities, three seeds,
+30,000 steps. `cheetah`: the same agents on HalfCheetah-v5 with hidden velocities, one seed each,
+100,000 steps. `cost`: milliseconds of a step of `td3` on Pendulum-v1, minus those of the simulator
+alone and of the same agent on the pendulum of this package. The script writes
+gymnasium_simulators.md, .parquet and .json; existing rows are kept.
 """
 
 import argparse
@@ -49,7 +49,7 @@ OWN = {
     "InvertedPendulum-v5": {"gamma": 0.99, "exploration_noise": 0.1},
     "HalfCheetah-v5": {"gamma": 0.99, "exploration_noise": 0.1, "update_every": 1},
 }
-"""Fields in which a task differs from the pendulum's setting."""
+"""Fields in which a task differs from the settings of the pendulum."""
 EPISODES = 100
 
 
@@ -59,7 +59,7 @@ def make(name: str, how: dict[str, Any]) -> Any:
 
 
 def trained(task: str, index: int, episodes: int, tiny: dict[str, Any]) -> list[dict[str, Any]]:
-    """Train and test one line of a task; a row per seed."""
+    """Train and test one line of a task; return a row per seed."""
     name, how, seeds, fields = TASKS[task][index]
     env = make(name, how)
     config = rtd.Config(**{**SETTING, **OWN.get(name, {}), **fields, **tiny})
@@ -82,7 +82,7 @@ def trained(task: str, index: int, episodes: int, tiny: dict[str, Any]) -> list[
 
 
 def cost(steps: int) -> dict[str, Any]:
-    """Milliseconds of a step: of training on the simulator, on our own, and of the simulator."""
+    """Milliseconds of a step: training on the simulator, on our pendulum, and the simulator."""
     found: dict[str, list[float]] = {"simulated": [], "own": [], "simulator": []}
     config = rtd.Config(**{**SETTING, **FEED_FORWARD, "total_steps": steps, "eval_every": steps})
     environments = {"simulated": rtd.from_gymnasium("Pendulum-v1"), "own": rtd.make("pendulum")}
@@ -99,13 +99,13 @@ def cost(steps: int) -> dict[str, Any]:
             if truncated:
                 simulator.reset()
         found["simulator"].append(1e3 * (time.perf_counter() - began) / steps)
-    # The first round compiles.
+    # The first round includes compilation.
     return {name: float(np.median(values[1:])) for name, values in found.items()}
 
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
+    parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
     parser.add_argument("--tasks", nargs="+", choices=(*TASKS, "cost"), default=["pendulum"])
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
     options = parser.parse_args(arguments)
@@ -145,7 +145,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def report(table: pd.DataFrame) -> str:
-    """All tasks as one table, the pendulum's difference, and the cost of a step."""
+    """A table of all tasks, the difference of the pendulums, and the time of a step."""
     body = []
     lanes = table[table["task"] != "cost"]
     for (name, algorithm), own in lanes.groupby(["environment", "algorithm"], sort=False):

@@ -1,10 +1,11 @@
-"""Sixteen environments or one, at equal transitions and updates: returns and time, on the rover.
+"""Compares sixteen environments with one, with equal transitions and updates, on the rover.
 
 Usage: python experiments/many_environments.py [--quick] [--seeds N] [--out DIR]
 
-`lstm-td3-1ha1hc` under AR(1) slip with the setting of the preset `rover`, five paired seeds, tested
-on 1,000 episodes each. Both ways are trained in turns, seed by seed, so that what else the machine
-does meets both. Writes many_environments.md, .parquet and .json.
+The agent is `lstm-td3-1ha1hc` under AR(1) slip with the settings of the preset `rover`. There are
+five paired seeds, each tested in 1,000 episodes. Both variants are trained alternately, seed by
+seed, so other work on the machine affects both. The script writes many_environments.md, .parquet
+and .json.
 """
 
 import argparse
@@ -45,7 +46,7 @@ def trained(count: int, seed: int, episodes: int, tiny: dict[str, object]) -> di
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
+    parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
     parser.add_argument("--seeds", type=int, default=SEEDS)
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
     options = parser.parse_args(arguments)
@@ -54,7 +55,7 @@ def main(arguments: list[str] | None = None) -> int:
         tiny = {"total_steps": 160, "hidden_size": 4, "batch_size": 4, "learning_starts": 16}
         tiny |= {"eval_every": 160, "eval_episodes": 1}
         options.seeds, episodes = 2, 2
-    else:  # both programs are compiled before anything is timed
+    else:  # compile both programs before the measurements
         for count in COUNTS:
             trained(count, 99, 1, {"total_steps": 2_000})
     rows = []

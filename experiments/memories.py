@@ -1,12 +1,13 @@
-"""Which memory is best where noise must be averaged, and where a wave must be followed?
+"""Compares memories under noise and under a random sine.
 
 Usage: python experiments/memories.py [--quick] [--seeds N] [--out DIR]
 
-`lstm-td3-1ha1hc` with the LSTM, the GRU and the minimal GRU, whose tokens are scanned in parallel,
-on the pendulum under `noise` and `random-sine`: l = 20, width 64, segments, the evidence's setting,
-1,000 episodes. Writes memories.md, .parquet and .json; a row that is there is not trained again.
+The agent is `lstm-td3-1ha1hc` with the LSTM, the GRU and the minimal GRU (with a parallel scan),
+on the pendulum under `noise` and `random-sine`: l = 20, width 64, segments, the settings of the
+preset, 1,000 episodes. The script writes memories.md, .parquet and .json; existing rows are not
+trained again.
 
-Returns are normalised: 0 is the uniform-random policy, 1 the fully observed optimum.
+Returns are normalised: 0 is the uniform random policy, 1 is the fully observed optimum.
 """
 
 import argparse
@@ -38,7 +39,7 @@ SETTING = {
 
 
 def trained(memory: str, disturbance: str, seeds: int, episodes: int, tiny: dict) -> list[dict]:
-    """Train and test; a row per seed."""
+    """Train and test; return a row per seed."""
     began = time.process_time()
     env = rtd.make("pendulum", disturbance)
     config = rtd.Config(**{**SETTING, "memory": memory, **tiny})
@@ -63,7 +64,7 @@ def trained(memory: str, disturbance: str, seeds: int, episodes: int, tiny: dict
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
+    parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
     options = parser.parse_args(arguments)

@@ -1,8 +1,9 @@
-"""The paper's table of parameter counts, counted from real networks.
+"""Counts the parameters of networks, for the paper's table.
 
 Usage: python experiments/parameter_counts.py [--quick] [--out DIR]
 
-Writes parameter_counts.md and .parquet: observations of 3 elements, actions of 1, width 128.
+The script writes parameter_counts.md and .parquet, for observations of 3 elements, actions of 1
+element, and width 128.
 """
 
 import argparse
@@ -27,7 +28,7 @@ PAPER = {
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="the same: it is quick")
+    parser.add_argument("--quick", action="store_true", help="no effect: the script is fast")
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
     options = parser.parse_args(arguments)
     rows = []

@@ -1,19 +1,19 @@
-"""The paper's pendulum figures: agents, disturbances, window lengths, and what action history adds.
+"""Trains and tests the agents for the paper's figures of the pendulum.
 
 Usage: python experiments/pendulum.py [--quick] [--run DIR] [--out DIR] [--steps N] [--seeds N]
                                       [--lengths L ...] [--width H] [--disturbances D ...]
                                       [--algorithms A ...] [--report]
 
-Trains the cells of experiments/pendulum_cells.py that are not in the table yet, as a study in DIR;
-the same command goes on with what is missing, also in another DIR: rows in the table are not
-trained again. Then tests each agent under its own disturbance, and those of `random-sine` under
-five other conditions, 1,000 episodes each. Writes pendulum.md and .parquet, generalisation.md and
-.parquet, pendulum_curves.parquet, and the pictures of experiments/pendulum_figures.py. The paper
-has five seeds, lengths 1 to 20 and width 128; the table says what was run. `--report` does not
-train: it gathers what all run directories below DIR hold, half a study included. Rows of lanes that
-are not there stay as they are; those of an earlier setting are marked.
+The script trains the cells of experiments/pendulum_cells.py that are not in the table yet, as a
+study in DIR. If you repeat the command, also with another DIR, it only trains what is missing from
+the table. Then it tests each agent under its own disturbance, and the agents of `random-sine` under
+five other conditions, in 1,000 episodes each. It writes pendulum.md and .parquet, generalisation.md
+and .parquet, pendulum_curves.parquet, and the pictures of experiments/pendulum_figures.py. The
+paper has five seeds, lengths 1 to 20 and width 128; the table states what was run. `--report` does
+not train: it reads all run directories in DIR, also incomplete studies. Other rows of the table do
+not change; rows of earlier settings are marked.
 
-Returns are normalised: 0 is the uniform-random policy, 1 the fully observed optimum.
+Returns are normalised: 0 is the uniform random policy, 1 is the fully observed optimum.
 """
 
 import argparse
@@ -50,19 +50,19 @@ CONDITIONS = (
     "temporal-bias:amplitude_min=1.0,amplitude_max=1.0",
     "noise:sigma=1.0",
 )
-"""Under which agents of `random-sine` are tested (the paper's generalisation figure)."""
+"""Conditions for tests of the agents of `random-sine` (the paper's generalisation figure)."""
 LENGTHS = (6, 20, 1, 3, 10)
-"""The paper's, in an order in which there is soon a figure that can be read."""
+"""The paper's lengths, in an order that soon gives a useful figure."""
 ALL_DISTURBANCES = (*presets.PENDULUM_DISTURBANCES, *presets.ACTION_HISTORY_DISTURBANCES)
 TEST_EPISODES = 1_000
 EARLIER_EPISODES = 20
-"""Of rows in a table that did not say yet."""
+"""Values for rows of an old table without these columns."""
 REFERENCE_EPISODES = 1_000
 
 
 @functools.cache
 def scale(name: str) -> tuple[float, float]:
-    """Mean return of the uniform-random policy under a disturbance, and the ceiling."""
+    """Mean return of the uniform random policy under a disturbance, and the ceiling."""
     disturbance, parameters = parse_disturbance(name)
     env = rtd.make("pendulum", disturbance, **parameters)
     returns = rtd.evaluate(rtd.random_policy(env), env, REFERENCE_EPISODES, 0, true_reward=True)
@@ -70,16 +70,16 @@ def scale(name: str) -> tuple[float, float]:
 
 
 def normalised(lanes: pd.DataFrame, column: str) -> pd.Series:
-    """``true_return`` between the two ends of the disturbance that ``column`` names."""
+    """``true_return``, normalised by the scale of the disturbance in ``column``."""
     low, high = np.array([scale(name) for name in lanes[column]], np.float64).reshape(-1, 2).T
     return (lanes["true_return"] - low) / (high - low)
 
 
 def tested(run: pathlib.Path, trained_on: str, episodes: int) -> pd.DataFrame:
-    """A row per lane of a disturbance and condition: mean true-state return, and normalised.
+    """A row per lane and condition: the mean return of the true state, also normalised.
 
-    The condition is what the lane was trained on; for `random-sine`, each of `CONDITIONS`. Empty
-    when no lane is trained yet.
+    The condition is the lane's own disturbance; for `random-sine`, also each of `CONDITIONS`. The
+    table is empty if no lane is trained yet.
     """
     directory = RunDirectory.open(run)
     trained = [cell for cell in directory.cells if cell.disturbance == trained_on]
@@ -109,25 +109,25 @@ def all_tested(run: pathlib.Path, episodes: int) -> pd.DataFrame:
 
 
 def own_setting(config: rtd.Config) -> str:
-    """What `current_setting` would say of this configuration."""
+    """The text of `current_setting` for this configuration."""
     fields = settings_of(config.algorithm)
     return setting_text({name: getattr(config, name) for name in fields})
 
 
 def with_others(lanes: pd.DataFrame, path: pathlib.Path, column: str) -> pd.DataFrame:
-    """``lanes``, and the others of the table at ``path``; ``column`` tells a lane's rows apart."""
+    """``lanes`` and the other rows of the table at ``path``; ``column`` is part of its key."""
     if not path.exists():
         return lanes
     kept = pd.read_parquet(path)
     if "setting" not in kept:
-        kept["setting"] = "the configuration's defaults"  # as all tables were, when none was noted
+        kept["setting"] = "the configuration's defaults"  # as in all tables without this column
     key = ["algorithm", "history_length", column, "seed"]
     replaced = pd.MultiIndex.from_frame(kept[key]).isin(pd.MultiIndex.from_frame(lanes[key]))
     return pd.concat([lanes, kept[~replaced]], ignore_index=True)
 
 
 def of_each(lanes: pd.DataFrame, column: str) -> dict[str, str]:
-    """``steps``, ``seeds`` and the like of each disturbance; by agent where they differ."""
+    """Values of ``column`` for each disturbance; by agent if they differ."""
     found = {}
     for name, here in lanes.groupby("disturbance"):
         agents = here.groupby(column)["algorithm"].unique()
@@ -142,10 +142,10 @@ def of_each(lanes: pd.DataFrame, column: str) -> dict[str, str]:
 def table(
     lanes: pd.DataFrame, column: str, names: tuple[str, ...], filtered: dict[str, float]
 ) -> str:
-    """Agents and lengths down, disturbances across: mean normalised return ± std over seeds.
+    """Mean normalised return ± std over seeds: rows are agents and lengths, columns disturbances.
 
-    Cells that were trained with an earlier setting are marked. ``filtered`` has the filter's
-    returns, in a row of their own.
+    Cells that were trained with earlier settings are marked. ``filtered`` has the returns of the
+    filter, for a separate row.
     """
     older = lanes["setting"] != lanes["algorithm"].map(current_setting)
     body = []
@@ -168,7 +168,7 @@ def table(
 
 
 def facts(lanes: pd.DataFrame, began: float) -> dict[str, object]:
-    """What was run, for the table's foot."""
+    """The facts below the table."""
     cells = lanes.groupby(["algorithm", "history_length", "disturbance"])
     return provenance(
         normalised="0 is the uniform-random policy, 1 the fully observed optimum",
@@ -186,7 +186,7 @@ def facts(lanes: pd.DataFrame, began: float) -> dict[str, object]:
 
 
 def curves_of(run: pathlib.Path) -> pd.DataFrame:
-    """Learning curves of a run directory, normalised: a row per lane and evaluation."""
+    """Normalised learning curves of a run directory: a row per lane and evaluation."""
     kept = pd.read_parquet(run / "curves.parquet")
     kept = kept.assign(normalised=normalised(kept, "disturbance").round(4))
     configs = {tuple(c.key.values()): c.config for c in RunDirectory.open(run).cells}
@@ -197,7 +197,7 @@ def curves_of(run: pathlib.Path) -> pd.DataFrame:
 
 
 def report(options: argparse.Namespace, episodes: int, began: float) -> int:
-    """Write tables and pictures of what there is in the run directories below ``options.run``."""
+    """Write tables and pictures of the run directories in ``options.run``."""
     runs = [path.parent for path in sorted(options.run.rglob("config.json"))]
     found = {run: rows for run in runs if len(rows := all_tested(run, episodes))}
     if not found:
@@ -230,14 +230,14 @@ def report(options: argparse.Namespace, episodes: int, began: float) -> int:
 
 
 def train(options: argparse.Namespace, tiny: dict[str, object]) -> list[str]:
-    """Train the cells that the table lacks; a line for each lane that was lost."""
+    """Train the cells missing from the table; return a line for each lane that was lost."""
     path = options.out / "pendulum.parquet"
     table = pd.read_parquet(path) if path.exists() else pd.DataFrame()
     if len(table) and "setting" not in table:
-        table = pd.DataFrame()  # of a version that did not note it
+        table = pd.DataFrame()  # an earlier version wrote the table
     wanted = cells(options, tiny)
     todo = missing(wanted, table, options.seeds)
-    print(f"{len(wanted) - len(todo)} of {len(wanted)} cells stand in {path}", flush=True)
+    print(f"{path} has {len(wanted) - len(todo)} of {len(wanted)} cells", flush=True)
     if not todo:
         return []
     study = rtd.Study(
@@ -248,7 +248,7 @@ def train(options: argparse.Namespace, tiny: dict[str, object]) -> list[str]:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
+    parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
     parser.add_argument("--run", type=pathlib.Path, default=pathlib.Path("runs/pendulum"))
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
     parser.add_argument(

@@ -1,10 +1,10 @@
-"""What experiments/pendulum.py trains: the cells of the paper's pendulum figures.
+"""The cells of the paper's figures of the pendulum, for experiments/pendulum.py.
 
-Six agents under the paper's four disturbances, and `lstm-td3` with and without past actions under
-three more, where the paper compares them; each at every window length. Their settings are those of
-the preset `pendulum`; experiments/pendulum_search.py found them, under `hidden`. `h-td3` has
-settings of its own: its critics read carries that an actor of long ago stored, and its actor moves
-on meanwhile.
+The cells are six agents under the paper's four disturbances, and `lstm-td3` with and without past
+actions under three other disturbances, for which the paper compares both; each with every window
+length. The settings are those of the preset `pendulum`; experiments/pendulum_search.py found them
+under `hidden`. `h-td3` has different settings, because its critics read carries that an old version
+of the actor stored.
 """
 
 import argparse
@@ -18,20 +18,20 @@ from rtd3jax.study import presets
 
 
 def settings_of(algorithm: str) -> dict[str, object]:
-    """Fields of the configuration in which the agent differs from the defaults."""
+    """Fields of the agent's configuration that differ from the defaults."""
     return {**presets.PENDULUM_SETTINGS, **presets.PENDULUM_OWN_SETTINGS.get(algorithm, {})}
 
 
 def current_setting(algorithm: str) -> str:
-    """`settings_of` the agent, as it stands in tables."""
+    """`settings_of` the agent, as the text in tables."""
     return setting_text(settings_of(algorithm))
 
 
 def cells(options: argparse.Namespace, tiny: dict[str, Any]) -> list[rtd.Cell]:
-    """Those of the given lengths, disturbances and agents, in the order of the lengths.
+    """The cells of the given lengths, disturbances and agents, in the order of the lengths.
 
-    Without ``options.disturbances`` the paper's, and its comparison of action history. ``tiny`` are
-    fields that make them small.
+    Without ``options.disturbances``, they are the paper's cells, with its comparison of action
+    history. ``tiny`` holds fields for a small configuration.
     """
     pairs = [
         (disturbance, algorithm)
@@ -64,7 +64,7 @@ def cells(options: argparse.Namespace, tiny: dict[str, Any]) -> list[rtd.Cell]:
 
 
 def missing(wanted: list[rtd.Cell], lanes: pd.DataFrame, seeds: int) -> list[rtd.Cell]:
-    """The cells of which the table ``lanes`` lacks a seed, or has it of another training."""
+    """The cells of which the table ``lanes`` has not all seeds with the current settings."""
 
     def stands(cell: rtd.Cell) -> bool:
         config = cell.config

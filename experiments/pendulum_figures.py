@@ -1,17 +1,17 @@
-"""The paper's pendulum figures, drawn as the paper draws them, from the tables that are kept.
+"""Draws the paper's figures of the pendulum from the tables of results.
 
 Usage: python experiments/pendulum_figures.py [--results DIR] [--out DIR]
 
-Reads pendulum.parquet, pendulum_curves.parquet and generalisation.parquet, and writes, as PNG and
-SVG, what they have rows for:
+The script reads pendulum.parquet, pendulum_curves.parquet and generalisation.parquet. It writes the
+following figures as PNG and SVG, if the tables have rows for them:
 
-* pendulum_learning_curves: rows are disturbances, columns agents, a curve per length;
-* pendulum: final return against the agent, a line per length, dots are seeds; dashes are a Bayes
-  filter that knows the process;
+* pendulum_learning_curves: rows are disturbances, columns are agents, a curve per length;
+* pendulum: final return for each agent, a line per length; dots are seeds; the dashed line is a
+  Bayes filter that knows the process;
 * action_history: `lstm-td3` with and without past actions, a panel per length;
 * generalisation: bars of the agents trained on `random-sine`, a panel per condition.
 
-Only rows of the current setting are drawn. Bands and bars are one standard deviation over seeds.
+Only rows with the current settings are drawn. Bands and bars are one standard deviation over seeds.
 """
 
 import argparse
@@ -34,18 +34,18 @@ from writing import RESULTS  # noqa: E402
 DISTURBANCES = (*presets.PENDULUM_DISTURBANCES, *presets.ACTION_HISTORY_DISTURBANCES)
 GREY = "#777777"
 LINES = {0: "#000000", 1: "#56B4E9", 3: "#009E73", 6: "#E69F00", 10: "#D55E00", 20: "#CC79A7"}
-"""A colour per history length; 0 is an agent without one."""
+"""A colour for each history length; 0 is for agents without a window."""
 
 
 def current(rows: pd.DataFrame) -> pd.DataFrame:
-    """The rows that were trained with the setting of today."""
+    """The rows that were trained with the current settings."""
     if rows.empty or "setting" not in rows:
         return rows.iloc[:0]
     return rows[rows["setting"] == rows["algorithm"].map(current_setting)]
 
 
 def save(figure: Figure, out: pathlib.Path, name: str) -> None:
-    """As PNG and SVG; the SVG is the same file whenever the data are."""
+    """Save as PNG and SVG; equal data give equal SVG files."""
     out.mkdir(parents=True, exist_ok=True)
     figure.savefig(out / f"{name}.png", dpi=150)
     with matplotlib.rc_context({"svg.hashsalt": name}):
@@ -70,8 +70,7 @@ def name_of(length: int) -> str:
 def filter_returns(results: pathlib.Path) -> dict[str, float]:
     """Normalised returns of a Bayes filter that knows the process, by disturbance.
 
-    Of experiments/filter_reference.py: no agent needs to know more than it does, so that they bound
-    the best agent's from below.
+    They come from experiments/filter_reference.py, and are a lower bound of the optimal return.
     """
     path = results / "filter_reference.parquet"
     if not path.exists():
@@ -80,7 +79,7 @@ def filter_returns(results: pathlib.Path) -> dict[str, float]:
 
 
 def learning_curves(curves: pd.DataFrame) -> Figure:
-    """Mean over seeds of the normalised return, a band of one standard deviation."""
+    """Draw the mean normalised return over seeds, with a band of one standard deviation."""
     names = [name for name in DISTURBANCES if (curves["disturbance"] == name).any()]
     agents = agents_in(curves)
     figure = Figure(figsize=(2.1 * len(agents) + 1, 1.7 * len(names) + 0.6), layout="constrained")
@@ -112,9 +111,9 @@ def learning_curves(curves: pd.DataFrame) -> Figure:
 
 
 def final_returns(lanes: pd.DataFrame, filtered: dict[str, float]) -> Figure:
-    """A panel per disturbance, agents across, a line per length; dots are seeds.
+    """Draw a panel per disturbance: agents along x, a line per length; dots are seeds.
 
-    The line of dashes is the return of the filter.
+    The dashed line is the return of the filter.
     """
     names = [name for name in DISTURBANCES if (lanes["disturbance"] == name).any()]
     columns = min(len(names), 4)
@@ -150,7 +149,7 @@ def final_returns(lanes: pd.DataFrame, filtered: dict[str, float]) -> Figure:
 
 
 def action_history(lanes: pd.DataFrame) -> Figure | None:
-    """`lstm-td3` with and without past actions, a panel per length."""
+    """Draw `lstm-td3` with and without past actions, with a panel per length."""
     pair = ("lstm-td3", "lstm-td3-no-action")
     own = lanes[lanes["algorithm"].isin(pair)]
     lengths = lengths_in(own)
@@ -169,7 +168,7 @@ def action_history(lanes: pd.DataFrame) -> Figure | None:
 
 
 def generalisation(moved: pd.DataFrame) -> Figure | None:
-    """Agents trained on `random-sine` under each condition: a panel per length."""
+    """Draw agents trained on `random-sine` under each condition, with a panel per length."""
     lengths = [length for length in lengths_in(moved) if length]
     if not lengths:
         return None
@@ -185,7 +184,7 @@ def generalisation(moved: pd.DataFrame) -> Figure | None:
 
 
 def _legend_of_lengths(figure: Figure, shown: dict[int, object]) -> None:
-    """A name for the line of each length in ``shown``, beside the panels."""
+    """Draw a legend of the lengths in ``shown``, next to the panels."""
     order = sorted(shown)
     figure.legend(
         [shown[length] for length in order],
@@ -198,7 +197,7 @@ def _legend_of_lengths(figure: Figure, shown: dict[int, object]) -> None:
 def _bars(
     axes: object, rows: pd.DataFrame, column: str, names: list[str], agents: list[str]
 ) -> None:
-    """Bars of the agents side by side for each of ``names``."""
+    """Draw a group of bars, one for each agent, for each of ``names``."""
     width = 0.8 / len(agents)
     for k, agent in enumerate(agents):
         found = rows[rows["algorithm"] == agent].groupby(column)["normalised"]
@@ -215,7 +214,7 @@ def _bars(
 
 
 def draw_all(results: pathlib.Path, out: pathlib.Path) -> None:
-    """Every figure that the tables in ``results`` have rows for."""
+    """Draw every figure for which the tables in ``results`` have rows."""
 
     def rows(name: str) -> pd.DataFrame:
         path = results / f"{name}.parquet"

@@ -1,13 +1,12 @@
-"""The pendulum swung up by `td3` and by a recurrent agent under one and the same disturbance.
+"""Animates `td3` and a recurrent agent on the pendulum under the same disturbance.
 
 Usage: python experiments/pendulum_pictures.py [--run DIR] [--disturbance D] [--history-length L]
                                                [--seed N] [--agents A B] [--out DIR] [--quick]
 
-Loads two policies of one study of experiments/pendulum.py and lets them play the same twenty
-episodes; shown is the one whose difference in returns is nearest to the mean difference (in the
-median episode both do alike). Writes pendulum_swing.gif: the pendulum as it is, the
-one that the sensors report, and what the disturbance does to the angular velocity's reading
-beneath.
+The script loads two policies of a study of experiments/pendulum.py, and plays the same twenty
+episodes with both. It shows the episode whose difference of returns is nearest to the mean
+difference (in the median episode, both returns are similar). It writes pendulum_swing.gif: the true
+pendulum, the observed pendulum, and below them the true and the observed angular velocity.
 """
 
 import argparse
@@ -30,7 +29,7 @@ SEEN = "#D55E00"
 
 
 def tip(observation: np.ndarray) -> np.ndarray:
-    """Where the rod ends, [2], for (cos, sin, velocity); upright is (0, 1), noise may stretch."""
+    """The end of the rod, [2], for (cos, sin, velocity); upright is (0, 1)."""
     return np.array([-observation[1], observation[0]])
 
 
@@ -71,7 +70,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--run", type=pathlib.Path, default=pathlib.Path("runs/pendulum/main"))
     parser.add_argument("--disturbance", default="random-sine")
     parser.add_argument("--history-length", type=int, default=6)
-    parser.add_argument("--seed", type=int, default=0, help="of the policies")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the policies")
     parser.add_argument("--agents", nargs=2, default=["td3", "lstm-td3-1ha1hc"])
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
     parser.add_argument("--quick", action="store_true", help="few frames")

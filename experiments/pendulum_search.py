@@ -1,15 +1,15 @@
-"""Which setting lets every agent swing up the pendulum whose velocity is hidden?
+"""Searches settings with which every agent swings up the pendulum with hidden velocity.
 
 Usage: python experiments/pendulum_search.py [--quick] [--out FILE]
 
-The paper's pendulum figures are 670 trainings of width 128, half of whose cost is at l = 20; so the
-setting that is sought is the best of those that make about 7,500 updates of 100 transitions, or as
-many operations in smaller batches. It is sought with `lstm-td3-no-action`, which was furthest from
-the goal of the agents that share a setting, and with `h-td3`, whose critics read carries that an
-actor of long ago stored and which has fields of its own. Seeds from 100 on are not reported
-elsewhere. Writes experiments/results/pendulum_search.csv: a row per setting, with the final
-policies' normalised return over 400 episodes. A setting whose row is there already is not trained
-again. Rows of an earlier search, whose agents read actions in N m, stay at the top.
+The paper's figures of the pendulum need 670 trainings of width 128, and half of their time is for l
+= 20. So the search is limited to settings with about 7,500 updates of 100 transitions, or with the
+same number of operations in smaller batches. It uses `lstm-td3-no-action`, which was the worst of
+the agents with common settings, and `h-td3`, which has different settings because its critics read
+carries that an old version of the actor stored. The seeds begin at 100 and are not reported
+elsewhere. The script writes experiments/results/pendulum_search.csv: a row per setting, with the
+normalised return of the final policies over 400 episodes. Existing rows are not trained again. Rows
+of an earlier search, whose agents read actions in N m, are at the top.
 """
 
 import pathlib
@@ -48,7 +48,7 @@ BASE = {
     "actor_noise": 0.0,
     "policy_delay": 2,
 }
-"""What rows of the earlier search lack they had at these values."""
+"""Values of fields that rows of the earlier search do not have."""
 _SHARED = {
     "actions": "half ranges",
     "hidden_size": 128,
@@ -75,21 +75,21 @@ CHANGES: tuple[dict, ...] = (
     {**EVERY_FOURTH, **FASTER},
     HALF_BATCHES,
     {**HALF_BATCHES, **FASTER},
-    # More and smaller updates; faster targets; a smoothed value.
+    # More updates with smaller batches; a higher target rate; a smoothed value.
     {**HALF_BATCHES, **FASTER, "update_every": 1, "batch_size": 32, "total_steps": 20_000},
     {**HALF_BATCHES, **FASTER, "tau": 0.02},
     {**HALF_BATCHES, **FASTER, "actor_noise": 0.1},
     {**HALF_BATCHES, **FASTER, "algorithm": "lstm-td3-1ha1hc"},
-    # h-td3 explores more, forgets sooner and has a slower actor; an update of it costs less.
+    # h-td3: more exploration, a shorter replay, a lower actor rate; its updates are faster.
     {**HALF_BATCHES, **FASTER, **CARRIED},
     {**HALF_BATCHES, **FASTER, **CARRIED, "tau": 0.005},
     {**HALF_BATCHES, **CARRIED, "update_every": 1},
 )
-"""What each setting changes in `BASE`."""
+"""The changes of each setting to `BASE`."""
 
 
 def search(setting: dict, episodes: int) -> dict:
-    """Train the setting and evaluate it; the results of a row."""
+    """Train and evaluate a setting; return the results of its row."""
     began = time.perf_counter()
     others = ("actions", "disturbance", "seeds")
     config = rtd.Config(**{name: value for name, value in setting.items() if name not in others})

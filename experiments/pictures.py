@@ -1,4 +1,4 @@
-"""What the animations share: two policies of a run, and a GIF."""
+"""Code that the animations share: loads the policies of a run, and writes a GIF."""
 
 import pathlib
 from collections.abc import Callable, Sequence
@@ -12,7 +12,7 @@ import rtd3jax as rtd
 def load_policies(
     run: pathlib.Path, agents: Sequence[str], history_length: int | None = None, **which: object
 ) -> dict[str, rtd.Policy]:
-    """The policies there are, by agent; says which are missing. td3 has no ``history_length``."""
+    """The trained policies by agent; prints the missing ones. td3 has no ``history_length``."""
     found = {}
     for agent in agents:
         length = None if agent == "td3" else history_length
@@ -26,7 +26,7 @@ def load_policies(
 def save_gif(
     figure: Figure, frame: Callable[[int], list], path: pathlib.Path, steps: int, every: int
 ) -> None:
-    """Every so-many-th frame of ``steps``; ``frame`` draws what is known after so many steps."""
+    """Save every ``every``-th frame of ``steps``; ``frame`` draws the state after a step."""
     FuncAnimation(figure, frame, frames=range(1, steps + 1, every)).save(
         path, writer=PillowWriter(fps=20), dpi=80
     )

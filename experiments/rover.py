@@ -1,13 +1,14 @@
-"""The paper's rover table: trained on AR(1), sine or no slip; tested on four slip processes.
+"""Trains and tests agents for the paper's rover tables.
 
 Usage: python experiments/rover.py [--quick] [--run DIR] [--out DIR] [--steps N] [--report]
 
-Trains six agents under three slips, five seeds each, in a run directory of the sweep; the same
-command goes on with what is missing. Then evaluates every policy there is under the processes of
-the paper's table. Writes rover.md, rover.parquet (a row per policy and process), rover.png and the
-learning curves. `--report` only evaluates what the table lacks; rows of an earlier setting stay,
-and are marked, where nothing was trained with this one. One setting for all agents,
-that of the preset: experiments/rover_search.py found it on seeds that are not among the five.
+The script trains six agents on AR(1) slip, on sine slip and without slip, with five seeds each, in
+a run directory of the sweep; if you repeat the command, it only trains what is missing. Then it
+evaluates every policy under the four slip processes of the paper's tables. It writes rover.md,
+rover.parquet (a row per policy and process), rover.png and the learning curves. `--report` only
+evaluates policies that are missing from the table. Rows of earlier settings are kept and marked if
+there is no training with the current settings. All agents have the settings of the preset, which
+experiments/rover_search.py found with seeds that are not among the five.
 """
 
 import argparse
@@ -51,7 +52,7 @@ COLUMNS = (
     ("sine-slip", "ar1-slip-fast"),
     ("sine-slip", "ar1-slip-slow"),
 )
-"""(trained on, tested on), as in the paper's Tables."""
+"""(trained on, tested on), as in the paper's tables."""
 
 _PAPER = """
 td3                -2.92 0.07 -2.94 0.09 -5.21 0.19 -7.75 0.17 -1.73 0.17 -5.33 0.14
@@ -69,7 +70,7 @@ PAPER = {
 
 
 def train(run: pathlib.Path, steps: int, tiny: dict[str, object]) -> list[str]:
-    """Train what is missing; a line for each lane that was lost."""
+    """Train the missing lanes; return a line for each lane that was lost."""
     cells = make_cells(PRESETS["rover"], {"total_steps": steps, **tiny})
     if tiny:
         cells = cells[:1]
@@ -79,10 +80,10 @@ def train(run: pathlib.Path, steps: int, tiny: dict[str, object]) -> list[str]:
 
 
 def evaluate_policies(run: pathlib.Path, episodes: int, known: pd.DataFrame | None, setting: str):
-    """A row per lane and process: mean over ``episodes`` and over the paper's twenty.
+    """A row per lane and process: the mean over ``episodes``, and over the paper's twenty.
 
-    Rows of ``known`` stay: those of this setting are not evaluated again, those of another one
-    stand where the run has no policy.
+    Rows of ``known`` with the current settings are not evaluated again. Rows with other settings
+    are kept if the run has no policy for them.
     """
     rows, missing = [], []
     names = ["trained_on", "tested_on", "algorithm", "seed"]
@@ -125,7 +126,7 @@ def evaluate_policies(run: pathlib.Path, episodes: int, known: pd.DataFrame | No
 
 
 def references(episodes: int) -> dict[str, dict[str, str]]:
-    """The ceiling, and what needs no training, on each process."""
+    """The ceiling and the policies without training, for each process."""
     rows: dict[str, dict[str, str]] = {}
     nominal = rtd.make("rover", "ar1-slip")
     for tested in dict.fromkeys(tested for _, tested in COLUMNS):
@@ -153,7 +154,7 @@ def pick(rows: pd.DataFrame, algorithm: str, trained: str, tested: str) -> pd.Da
 
 
 def spread(here: pd.DataFrame, setting: str) -> str:
-    """Mean ± standard deviation over seeds; with how many, where some are missing."""
+    """Mean ± standard deviation over seeds, and the number of seeds if some are missing."""
     values = here["mean"]
     count = "" if len(values) == SEEDS else f" ({len(values)} of {SEEDS} seeds)"
     deviation = f" ± {values.std(ddof=1):.2f}" if len(values) > 1 else ""
@@ -162,7 +163,7 @@ def spread(here: pd.DataFrame, setting: str) -> str:
 
 
 def table(rows: pd.DataFrame, others: dict[str, dict[str, str]], setting: str) -> str:
-    """The paper's two rover tables as one, our numbers above the paper's."""
+    """The paper's two rover tables as one, with our numbers above those of the paper."""
     header = ["agent", *(f"{trained} → {tested}" for trained, tested in COLUMNS)]
     body = []
     for algorithm in rtd.ALGORITHMS:
@@ -177,7 +178,7 @@ def table(rows: pd.DataFrame, others: dict[str, dict[str, str]], setting: str) -
 
 
 def order(rows: pd.DataFrame) -> str:
-    """The paper's order of the agents on AR(1) slip, pair by pair, and whether it held."""
+    """The paper's order of the agents on AR(1) slip, with a verdict for each pair."""
     header = ["trained on", "the paper's order: difference of means [95% interval]", "verdict"]
     body = []
     for column, (trained, tested) in list(enumerate(COLUMNS))[:2]:
@@ -190,7 +191,7 @@ def order(rows: pd.DataFrame) -> str:
 
 
 def draw(rows: pd.DataFrame, path: pathlib.Path) -> None:
-    """The transfer matrix: mean return of each agent (rows) in each column."""
+    """Draw the transfer matrix: the mean return of each agent (rows) in each column."""
     grid = np.full((len(rtd.ALGORITHMS), len(COLUMNS)), np.nan)
     for i, algorithm in enumerate(rtd.ALGORITHMS):
         for j, (trained, tested) in enumerate(COLUMNS):
@@ -214,11 +215,11 @@ def draw(rows: pd.DataFrame, path: pathlib.Path) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
+    parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
     parser.add_argument("--run", type=pathlib.Path, default=pathlib.Path("runs/rover"))
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
     parser.add_argument("--steps", type=int, default=STEPS)
-    parser.add_argument("--report", action="store_true", help="evaluate what there is; no training")
+    parser.add_argument("--report", action="store_true", help="evaluate without training")
     options = parser.parse_args(arguments)
     began, steps, episodes = time.time(), options.steps, EPISODES
     tiny: dict[str, object] = {}

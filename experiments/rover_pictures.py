@@ -1,10 +1,10 @@
-"""The rover driven by `td3` and by the best agent under one and the same slip.
+"""Animates `td3` and the best agent on the rover under the same slip.
 
 Usage: python experiments/rover_pictures.py [--run DIR] [--seed N] [--out DIR] [--quick]
 
-Loads two policies that experiments/rover.py trained and lets them drive through the same episode.
-Writes rover_drive.gif (the paths, the motion's error and the slip as they unfold) and
-rover_inferred_slip.png: the slip for which each command would have been right, beside the true one.
+The script loads two policies that experiments/rover.py trained, and plays the same episode with
+both. It writes rover_drive.gif (the paths, the errors of the motion, and the slip over time), and
+rover_inferred_slip.png: the true slip, and the slip for which each command would be exact.
 """
 
 import argparse
@@ -27,7 +27,7 @@ STEPS, SECONDS_PER_STEP = 200, 0.1
 
 
 def drive(policy: rtd.Policy, env, seed: int) -> dict[str, np.ndarray]:
-    """One episode: commands [T, 2], motion [T, 2], true slip [T, 2]; slip depends on seed alone."""
+    """One episode: commands, motion and slip, [T, 2] each; the slip only depends on ``seed``."""
     params = env.default_params
     reset_key, steps_key = jax.random.split(jax.random.key(seed))
     observation, state = env.reset(reset_key, params)
@@ -52,13 +52,13 @@ def drive(policy: rtd.Policy, env, seed: int) -> dict[str, np.ndarray]:
 
 
 def wheels(motion: np.ndarray, params) -> np.ndarray:
-    """Left and right wheel speeds [T, 2] of (speed, yaw rate) [T, 2]."""
+    """Left and right wheel speeds [T, 2] from (speed, yaw rate) [T, 2]."""
     half = 0.5 * params.wheelbase * motion[:, 1]
     return np.stack((motion[:, 0] - half, motion[:, 0] + half), axis=1)
 
 
 def path_of(motion: np.ndarray) -> np.ndarray:
-    """Positions [T, 2] in metres from speeds and yaw rates."""
+    """Positions [T, 2] in m from speeds and yaw rates."""
     heading = np.cumsum(motion[:, 1]) * SECONDS_PER_STEP
     velocity = motion[:, :1] * np.stack((np.cos(heading), np.sin(heading)), axis=1)
     return np.cumsum(velocity, axis=0) * SECONDS_PER_STEP
@@ -126,7 +126,7 @@ def animate(drives: dict[str, dict[str, np.ndarray]], path: pathlib.Path, every:
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--run", type=pathlib.Path, default=pathlib.Path("runs/rover"))
-    parser.add_argument("--seed", type=int, default=0, help="of the policies")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the policies")
     parser.add_argument("--agents", nargs=2, default=["td3", "lstm-td3-1ha1hc"])
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
     parser.add_argument("--quick", action="store_true", help="few frames")

@@ -1,11 +1,11 @@
-"""Which settings bring the agents to the rover's ceiling? Searched on seeds that are not reported.
+"""Searches settings with returns near the rover's ceiling, on seeds that are not reported.
 
 Usage: python experiments/rover_search.py [--quick] [--out FILE]
 
-One setting is sought for all agents, so the one that is searched with is the paper's best,
-`lstm-td3-1ha1hc`. Writes experiments/results/rover_search.csv: one row per setting, with the mean
-return of the final policies on `ar1-slip` (1,000 episodes a seed) beside the ceiling on as many.
-A setting whose row is there already is not trained again.
+All agents shall have the same settings, so the search uses the best agent of the paper,
+`lstm-td3-1ha1hc`. The script writes experiments/results/rover_search.csv: a row per setting, with
+the mean return of the final policies on `ar1-slip` (1,000 episodes per seed) and the ceiling.
+Existing rows are not trained again.
 """
 
 import pathlib
@@ -48,7 +48,7 @@ CHANGES: tuple[dict, ...] = (
         for gamma, rate in ((0.99, 1e-3), (0.99, 3e-4), (0.9, 1e-3))
     ),
     {"final_learning_rate_fraction": 0.0},
-    # Smoothing by 0.2 costs 0.08 a step where the best policy costs 0.006: noise in every target.
+    # Smoothing noise of 0.2 adds a cost of 0.08 per step, while the optimal policy costs 0.006.
     {"final_learning_rate_fraction": 0.0, "target_noise": 0.02},
     {"final_learning_rate_fraction": 0.0, "target_noise": 0.02, "gamma": 0.5},
     {"final_learning_rate_fraction": 0.0, "gamma": 0.0},
@@ -86,13 +86,13 @@ CHANGES: tuple[dict, ...] = (
         }
         for more in (
             {"exploration_noise": 0.05},
-            # A slower actor averages over the critic's wandering optimum.
+            # A lower actor rate averages over changes of the critic's optimum.
             {"learning_rate": 3e-3, "actor_rate": 0.1},
             {"learning_rate": 3e-3, "actor_rate": 0.1, "replay_capacity": 100_000},
             {"learning_rate": 3e-3, "actor_rate": 0.03},
             {"learning_rate": 1e-2, "actor_rate": 0.03},
             {"learning_rate": 3e-3, "actor_rate": 0.1, "total_steps": 40_000},
-            # A row is seen a hundred times, and its reward is mostly luck: more rows, fewer times.
+            # Each row is fitted a hundred times, and its reward is mostly noise: use more rows.
             {
                 "learning_rate": 3e-3,
                 "actor_rate": 0.1,
@@ -106,8 +106,8 @@ CHANGES: tuple[dict, ...] = (
                 "total_steps": 40_000,
                 "replay_capacity": 100_000,
             },
-            # One seed in five ends with a speed that is 0.03 m/s off throughout: what moves the
-            # critic's optimum? Four seeds see such a one.
+            # One seed in five has a constant speed error of 0.03 m/s at the end. Which setting
+            # prevents this? Four seeds show such a case.
             *(
                 {
                     "seeds": 4,
@@ -119,22 +119,22 @@ CHANGES: tuple[dict, ...] = (
                 }
                 for last in (
                     {},
-                    # Random commands cost a hundred times what good ones do: forget them ...
+                    # Random commands cost a hundred times as much as good commands: remove them ...
                     {"replay_capacity": 20_000},
-                    # ... or make fewer of them.
+                    # ... or use fewer of them.
                     {"learning_starts": 200},
                     {"learning_rate": 1e-3, "actor_rate": 0.3},
                     {"batch_size": 256},
-                    # Twice the rows and twice the averaging do not help: it is not luck alone.
+                    # Twice as many rows and twice the averaging: noise is not the only cause.
                     {"total_steps": 80_000},
-                    # What else could: wider exploration, a steadier critic and an actor after it.
+                    # Other causes: exploration, an unsteady critic, an actor that is too fast.
                     {"exploration_noise": 0.2},
                     {"learning_rate": 1e-3},
                 )
             ),
-            # The first critic's slope at the actor's own action is mostly kinks: averaged over
-            # actions as wide as exploration it errs half as much, and an actor may follow faster.
-            # Half of what is left is the luck of rewards that were fitted too often: more rows.
+            # The first critic's gradient at a single action is irregular. Averaged over actions as
+            # wide as the exploration, its error is half, and the actor rate can be higher.
+            # Half of the remaining loss is due to the noise of rewards that are fitted too often.
             *(
                 {
                     "learning_rate": 3e-3,
@@ -154,11 +154,11 @@ CHANGES: tuple[dict, ...] = (
         )
     ),
 )
-"""What each setting changes in `BASE`."""
+"""The changes of each setting to `BASE`."""
 
 
 def search(setting: dict, episodes: int) -> dict:
-    """Train the setting and evaluate it under nominal slip; the results of a row."""
+    """Train a setting and evaluate it under nominal slip; return the results of its row."""
     began = time.perf_counter()
     fields = {name: value for name, value in setting.items() if name in RTD_FIELDS}
     config = rtd.Config(

@@ -1,4 +1,4 @@
-"""A search over settings that may be stopped and gone on with: a row of a CSV for each setting."""
+"""A search over settings that can be interrupted and continued; each setting has a CSV row."""
 
 import argparse
 import pathlib
@@ -10,10 +10,10 @@ import pandas as pd
 def go_through(
     settings: Iterable[dict], search: Callable[[dict], dict], out: pathlib.Path, defaults: dict
 ) -> None:
-    """Append ``{**setting, **search(setting)}`` to ``out`` for each setting without a row there.
+    """Append ``{**setting, **search(setting)}`` to ``out`` for each setting without a row.
 
-    A row knows every field of its setting; ``defaults`` are the values of those fields that a row
-    of an earlier search lacks, because they were not varied then.
+    A row has every field of its setting. ``defaults`` are the values of fields that rows of an
+    earlier search do not have, because they were not varied then.
     """
     rows = pd.read_csv(out).to_dict("records") if out.exists() else []
     rows = [{**defaults, **row} for row in rows]
@@ -38,10 +38,10 @@ def search_main(
 ) -> None:
     """The command line of a search: ``search(setting, episodes)`` for each of ``changes``.
 
-    With ``--quick`` the first two, tiny.
+    With ``--quick``, only the first two, with tiny trainings.
     """
     parser = argparse.ArgumentParser(description=description.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
+    parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
     parser.add_argument("--out", type=pathlib.Path, default=results)
     options = parser.parse_args(arguments)
     tiny = {}

@@ -1,17 +1,18 @@
-"""Do returns pay for segments? Five paired seeds, windows against segments, the same steps.
+"""Compares returns with segments and with windows, in five paired seeds with equal steps.
 
 Usage: python experiments/segments_returns.py [--quick] [--search] [--tasks T ...] [--seeds N]
                                               [--out DIR] [--report]
 
-`lstm-td3-1ha1hc`, width 64, with the evidence's settings: the rover under AR(1) slip at l = 6, the
-pendulum under `hidden`, `random-sine` and `noise` at l = 6 and 20. Policies are tested on 1,000
-episodes; those of segments act with a carry that runs on, and those of windows are tested with one
-too, which they have never seen. The pendulum's returns are normalised, the rover's are divided by
-the paper's best, |-1.36|. Then both ways take turns, to say what share of the windows' time a step
-with segments takes. Writes segments_returns.md, .parquet and .json.
+The agent is `lstm-td3-1ha1hc` with width 64 and the settings of the presets, on the rover under
+AR(1) slip at l = 6, and on the pendulum under `hidden`, `random-sine` and `noise` at l = 6 and 20.
+Policies are tested in 1,000 episodes. Policies trained on segments act with a running carry;
+policies trained on windows are also tested with a running carry, which they have never seen. The
+pendulum's returns are normalised; the rover's returns are divided by the paper's best, |-1.36|.
+Then the times of a step with segments and with windows are measured alternately. The script writes
+segments_returns.md, .parquet and .json.
 
-`--search` goes through candidates on seeds from 100 on, which are not reported, and writes
-segments_search.csv. A row that is there is not trained again.
+`--search` tests candidates with seeds from 100 on, which are not reported, and writes
+segments_search.csv. Existing rows are not trained again.
 """
 
 import argparse
@@ -37,7 +38,7 @@ from rtd3jax.training.lanes import workers  # noqa: E402
 
 AGENT, WIDTH, EPISODES = "lstm-td3-1ha1hc", 64, 1_000
 PAPERS_BEST = 1.36
-"""What the rover's returns are divided by: the paper's best agent has -1.36."""
+"""The divisor of the rover's returns: the paper's best agent has -1.36."""
 SEARCH_SEED, SEARCH_SEEDS, SEARCH_EPISODES = 100, 2, 400
 TASKS: dict[str, tuple[str, str, int]] = {
     "rover ar1-slip l=6": ("rover", "ar1-slip", 6),
@@ -73,12 +74,12 @@ CANDIDATES: dict[tuple[str, int], list[tuple[int, int, bool, str]]] = {
     ],
     ("rover", 6): [(200, 10, False, "carry")],
 }
-"""Batch size, segment length, whether the burn-in has a gradient, and how the agent acts."""
+"""Batch size, segment length, whether the burn-in has gradients, and the way of acting."""
 SEARCHED = ("pendulum hidden l=6", "pendulum hidden l=20", "rover ar1-slip l=6")
 
 
 def settings(task: str) -> dict[str, Any]:
-    """The windows' setting of a task."""
+    """The settings of a task with windows."""
     env, _, length = TASKS[task]
     base = ROVER if env == "rover" else PENDULUM
     return {**base, "history_length": length, "hidden_size": WIDTH, "algorithm": AGENT}
@@ -87,7 +88,7 @@ def settings(task: str) -> dict[str, Any]:
 def returns(
     task: str, fields: dict[str, Any], seeds: range, episodes: int, tiny: dict[str, Any]
 ) -> dict[str, list[float]]:
-    """Normalised mean return of each seed's final policy, as it acts by itself and otherwise."""
+    """Normalised mean return of each seed's final policy, with both ways of acting."""
     env_id, disturbance, _ = TASKS[task]
     name, parameters = parse_disturbance(disturbance)
     env = rtd.make(env_id, name, **parameters)
@@ -105,7 +106,7 @@ def returns(
 
 
 def cost(task: str, fields: dict[str, Any], seconds: float, repeats: int) -> float:
-    """A step's time with segments as a share of the windows', measured in turns; the median."""
+    """Median time of a step with segments divided by that with windows, measured alternately."""
     sides = []
     for changes in ({}, fields):
         own = {**settings(task), **changes, "learning_starts": 1_000}
@@ -125,14 +126,14 @@ _OF_THE_BENCH = ("algorithm", "history_length", "total_steps", "eval_every")
 
 
 def kept(path: pathlib.Path) -> pd.DataFrame:
-    """The rows that are there."""
+    """The existing rows."""
     if not path.exists():
         return pd.DataFrame()
     return pd.read_csv(path) if path.suffix == ".csv" else pd.read_parquet(path)
 
 
 def has(rows: pd.DataFrame, **values: Any) -> bool:
-    """Whether there is a row of these values."""
+    """Whether there is a row with these values."""
     if rows.empty:
         return False
     there = np.ones(len(rows), bool)
@@ -142,7 +143,7 @@ def has(rows: pd.DataFrame, **values: Any) -> bool:
 
 
 def search(path: pathlib.Path, tasks: list[str], tiny: dict[str, Any]) -> None:
-    """Fill in the table of candidates."""
+    """Complete the table of candidates."""
     rows = kept(path)
     for task in (name for name in SEARCHED if name in tasks):
         env, _, length = TASKS[task]
@@ -174,7 +175,7 @@ def search(path: pathlib.Path, tasks: list[str], tiny: dict[str, Any]) -> None:
 
 
 def compare(out: pathlib.Path, tasks: list[str], seeds: int, tiny: dict[str, Any]) -> pd.DataFrame:
-    """Fill in the table of pairs, a row per task, way and seed."""
+    """Complete the table of pairs, with a row per task, variant and seed."""
     path = out / "segments_returns.parquet"
     rows = kept(path)
     for task in tasks:
@@ -206,7 +207,7 @@ def compare(out: pathlib.Path, tasks: list[str], seeds: int, tiny: dict[str, Any
 
 
 def table(rows: pd.DataFrame, shares: dict[str, float]) -> str:
-    """A line per task: both means, the paired difference with its 95% interval, and the time."""
+    """A line per task: both means, the paired difference with its 95% interval, the time."""
     body = []
     for task in TASKS:
         own = rows[rows["task"] == task]
@@ -238,9 +239,13 @@ def table(rows: pd.DataFrame, shares: dict[str, float]) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
-    parser.add_argument("--search", action="store_true", help="candidates, on unreported seeds")
-    parser.add_argument("--report", action="store_true", help="the table of what there is")
+    parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
+    parser.add_argument(
+        "--search", action="store_true", help="test candidates on seeds that are not reported"
+    )
+    parser.add_argument(
+        "--report", action="store_true", help="only write the table of existing rows"
+    )
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS), metavar="T")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)

@@ -1,25 +1,25 @@
-"""Settings of the trainings, as the sweep's flags, and the marks of earlier ones in tables."""
+"""Settings of the trainings as flags of the sweep, and marks of earlier settings in tables."""
 
 from collections.abc import Iterable
 
 
 def flags(settings: dict[str, object]) -> list[str]:
-    """Fields of the configuration, for the sweep's command line."""
+    """Fields of the configuration as flags of the sweep."""
     return [f"--{name.replace('_', '-')}={value}" for name, value in settings.items()]
 
 
 def setting_text(settings: dict[str, object]) -> str:
-    """The setting of a run's rows, by which rows of an earlier one are known."""
+    """The text of settings in a table, which distinguishes rows of earlier settings."""
     return " ".join(flags(settings))
 
 
 def mark(older: int, count: int) -> str:
-    """What follows a cell of ``count`` rows, ``older`` of which are of an earlier setting."""
+    """The mark of a cell with ``count`` rows, of which ``older`` have earlier settings."""
     if not older:
         return ""
     return " †" if older == count else f" († {older} of {count})"
 
 
 def notes(older: Iterable[str]) -> list[str]:
-    """The lines below a table that say what the marked rows were trained with."""
+    """The lines below a table with the settings of the marked rows."""
     return [f"\n† trained with {setting}" for setting in sorted(set(older))]

@@ -1,9 +1,9 @@
-"""How many lanes fit, and what ten thousand of them cost: computed, not measured.
+"""Computes how many lanes fit in memory, and the time of ten thousand lanes.
 
 Usage: python experiments/sizing.py [--quick] [--out DIR]
 
-Bytes are those of the memory plan (`rtd3jax.study.memory_plan`), seed-steps per second those that
-the benchmark measured on its machine (results/benchmarks/measurements.csv). Writes sizing.md and
+The bytes are those of the memory plan (`rtd3jax.study.memory_plan`), and the seed-steps per second
+are those of the benchmark (results/benchmarks/measurements.csv). The script writes sizing.md and
 .parquet.
 """
 
@@ -30,7 +30,7 @@ MACHINES = (1, 10, 100)
 
 
 def measured(bench: pathlib.Path) -> tuple[pd.Series, str]:
-    """Seed-steps per second by agent and length, the median of rounds; and the machine."""
+    """Median seed-steps per second by agent and length, and the name of the machine."""
     table = pd.read_csv(bench)
     ours = table[table["measurement"] == "rtd3jax float32"]
     rates = ours.groupby(["agent", "history_length"])["value"].median()
@@ -72,7 +72,7 @@ def rows_of(rates: pd.Series) -> list[dict]:
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="the same: it is quick")
+    parser.add_argument("--quick", action="store_true", help="no effect: the script is fast")
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
     options = parser.parse_args(arguments)
     bench = RESULTS / "benchmarks" / "measurements.csv"

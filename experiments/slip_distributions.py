@@ -1,9 +1,9 @@
-"""How slip is distributed under each of the paper's processes (the paper's figure of the rover).
+"""Computes the distribution of slip under each of the paper's processes (a figure of the paper).
 
 Usage: python experiments/slip_distributions.py [--quick] [--out DIR]
 
-Plays 4,000 episodes of 200 steps with the constant command and counts the slip of both wheels at
-every step. Writes slip_distributions.md, .parquet (the histogram) and .png.
+The script plays 4,000 episodes of 200 steps with the constant command, and records the slip of both
+wheels at every step. It writes slip_distributions.md, .parquet (the histogram) and .png.
 """
 
 import argparse
@@ -38,7 +38,7 @@ STEPS = 200
 
 
 def slips(process: str, episodes: int) -> np.ndarray:
-    """Slip of both wheels, as the motion shows it: [episodes, steps, 2]."""
+    """Slip of both wheels, computed from the motion: [episodes, steps, 2]."""
     env = rtd.make("rover", process)
     params = env.default_params
     command = jnp.array([params.target_speed, params.target_yaw_rate])

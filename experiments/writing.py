@@ -1,4 +1,4 @@
-"""What every experiment writes beside its picture: a table, and what made it."""
+"""Writes the table of an experiment, and the facts about its run."""
 
 import datetime
 import json
@@ -14,7 +14,7 @@ RESULTS = pathlib.Path(__file__).parent / "results"
 
 
 def provenance(**facts: object) -> dict[str, object]:
-    """Facts of a run, with versions, device and date."""
+    """Facts about a run, with versions, device and date."""
     return {
         **facts,
         "date": datetime.date.today().isoformat(),
@@ -27,7 +27,7 @@ def provenance(**facts: object) -> dict[str, object]:
 def write_results(
     out: pathlib.Path, name: str, table: pd.DataFrame, markdown: str, facts: dict[str, object]
 ) -> None:
-    """``name``.parquet, ``name``.md and ``name``.json in ``out``."""
+    """Write ``name``.parquet, ``name``.md and ``name``.json to ``out``."""
     out.mkdir(parents=True, exist_ok=True)
     table.to_parquet(out / f"{name}.parquet", index=False)
     lines = [markdown.rstrip(), "", *(f"- {key}: {value}" for key, value in facts.items())]
@@ -36,7 +36,7 @@ def write_results(
 
 
 def keep_curves(run: pathlib.Path, out: pathlib.Path, name: str) -> None:
-    """The learning curves that the sweep drew in ``run``, as ``name``_learning_curves.png."""
+    """Copy the learning curves of the sweep in ``run`` to ``name``_learning_curves.png."""
     drawn = run / "learning_curves.png"
     if drawn.exists():
         shutil.copyfile(drawn, out / f"{name}_learning_curves.png")

@@ -1,11 +1,12 @@
-"""A sweep on a Ray cluster of three nodes: the same tables, also when nodes and the driver die.
+"""Tests a sweep on a Ray cluster: the tables are the same, even if nodes and the driver die.
 
 Usage: python experiments/reliability/cluster.py [--quick]
 
-Needs Ray (pip install 'rtd3jax[ray]'). Starts Ray's own test cluster on this machine, a head and
-three nodes of one CPU each, and trains twelve small cells on it: undisturbed, with a node killed
-twice, and with the driver killed. Every table and lane is compared with a local run, byte by byte.
-Exit status 1 if any differs, or if no lane went on from a checkpoint after its node had died.
+The script needs Ray (pip install 'rtd3jax[ray]'). It starts Ray's test cluster on this machine,
+with a head and three nodes of one CPU each, and trains twelve small cells on it: without
+interruptions, with two killed nodes, and with a killed driver. It compares every table and lane
+with a local run, byte by byte. The exit status is 1 if a file differs, or if no lane continued from
+a checkpoint after its node had died.
 """
 
 import argparse
@@ -20,7 +21,7 @@ import sys
 import tempfile
 import time
 
-from kill_and_resume import contents  # beside this file
+from kill_and_resume import contents  # in the same directory
 
 STUDY = [
     *("--env", "rover", "--disturbances", "ar1-slip", "ar1-slip-fast", "ar1-slip-slow"),
@@ -33,14 +34,14 @@ QUICK = ["--disturbances", "ar1-slip", "--algorithms", "td3", "--total-steps", "
 
 
 def sweep(out, more, address=None):
-    """A running sweep."""
+    """Start a sweep."""
     where = [] if address is None else ["--cluster", address]
     command = [sys.executable, "-m", "rtd3jax.sweep", *STUDY, *more, "--out", str(out), *where]
     return subprocess.Popen(command, stdout=subprocess.DEVNULL)
 
 
 def wait_for_checkpoints(out, process, new=1):
-    """Until there are ``new`` more checkpoints than now of lanes under way; False at the end."""
+    """Wait for ``new`` more checkpoints of running lanes; return False if the sweep ends first."""
     before = set(out.glob("checkpoints/**/step-*.safetensors"))
     while process.poll() is None:
         if len(set(out.glob("checkpoints/**/step-*.safetensors")) - before) >= new:
@@ -50,12 +51,12 @@ def wait_for_checkpoints(out, process, new=1):
 
 
 def tasks(out):
-    """The tasks that ended."""
+    """The ended tasks."""
     return [json.loads(line) for line in (out / "cluster.jsonl").read_text().splitlines()]
 
 
 def overheads(out):
-    """Seconds of each task beside training, for processes that had a task before."""
+    """Overhead of each task in seconds, for processes that had a task before."""
     found, ends = [], {}
     for task in sorted(tasks(out), key=lambda task: task["began"]):
         if task["process"] in ends:

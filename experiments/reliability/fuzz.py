@@ -1,12 +1,12 @@
-"""Random configurations and command lines: each is run (tiny), or refused in one clear line.
+"""Tests random configurations and command lines: each runs, or is refused with a one-line error.
 
 Usage: python experiments/reliability/fuzz.py [--cases N] [--quick]
 
-Half of the cases build a `Config` from arbitrary Python values. The others are command lines of
-the sweep, whose values are sound, borderline, absurd or not numbers at all. A command line that
-is accepted is planned (`--dry-run`) and then trained for a few steps. Whatever raises anything but
-a `UserError`, or prints more than one line of error, is shown by hypothesis in its smallest form,
-and the exit status is 1.
+Half of the cases make a `Config` from arbitrary Python values. The others are command lines of the
+sweep, with values that are valid, at a limit, impossible, or not numbers. An accepted command line
+is planned (`--dry-run`) and then trained for a few steps. If a case raises an error other than
+`UserError`, or prints more than one line of error, hypothesis prints its smallest form, and the
+exit status is 1.
 """
 
 import argparse
@@ -38,7 +38,7 @@ VALUES = st.one_of(
     st.sampled_from([*rtd.ALGORITHMS, "1e-3", b"x", (), [1], 1 + 0j, float]),
 )
 
-# What shapes depend on has few sound values, so that few programs are compiled.
+# Fields that determine shapes have few valid values, so that few programs are compiled.
 SHAPES = {
     "--env": ["rover", "pendulum"],
     "--algorithms": list(rtd.ALGORITHMS),
@@ -80,7 +80,7 @@ ODD = st.one_of(
 
 @st.composite
 def command_lines(draw, shapes):
-    """Sound values for every flag, some of them replaced or added to."""
+    """Valid values for every flag, some of which are replaced or extended."""
     flags = {flag: draw(st.sampled_from(values)) for flag, values in shapes.items()}
     for flag in draw(st.lists(st.sampled_from(NUMBERS), max_size=3)):
         flags[flag] = draw(st.one_of(SMALL, SMALL, ODD))
@@ -94,7 +94,7 @@ def command_lines(draw, shapes):
 
 
 def call(arguments):
-    """Status and the two outputs of the command."""
+    """The exit status and the two outputs of the command."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         status = sweep.main(arguments)
@@ -121,12 +121,12 @@ def check_command(arguments, counts, root):
     assert status == 0 and "programs to compile" in out, (status, out, err)
     with tempfile.TemporaryDirectory(dir=root) as name:
         status, out, err = call([*arguments, "--quiet", f"--out={name}/run"])
-    if status == 2:  # what only shows when it is run: a shard, a device
+    if status == 2:  # an error that the plan does not find: a shard, a device
         assert err.startswith("error: ") and err.count("\n") == 1, err
         counts["command lines refused"] += 1
     else:
         assert status in (0, 1) and "Traceback" not in err, (status, err)
-        assert "failed:" not in err, err  # a lane may be lost to absurd numbers, not to an error
+        assert "failed:" not in err, err  # numbers may lose a lane, but must not raise an error
         counts["command lines run" if status == 0 else "command lines run, lane lost"] += 1
 
 
@@ -150,7 +150,7 @@ def main(arguments: list[str] | None = None) -> int:
         tempfile.TemporaryDirectory() as root,
         warnings.catch_warnings(),
         mock.patch.object(references, "EPISODES", 1),
-        mock.patch.object(derive, "learning_curves"),  # pictures take seconds each
+        mock.patch.object(derive, "learning_curves"),  # each figure takes seconds
         mock.patch.object(derive, "final_returns"),
         mock.patch.object(finish, "refresh_page"),
     ):

@@ -1,10 +1,10 @@
-"""Kill a sweep with SIGKILL at random moments, resume it, and compare with one that ran through.
+"""Kills a sweep at random times, resumes it, and compares it with an uninterrupted sweep.
 
 Usage: python experiments/reliability/kill_and_resume.py [--quick] [--trials N]
 
-A trial starts the sweep in a new directory, kills it at a random moment of its life (two times in
-three it is then started and killed once more), lets the same command finish, and compares every
-table and every lane's file byte by byte. Exit status 1 if any differs.
+A trial starts the sweep in a new directory, and kills it with SIGKILL at a random time (in two of
+three trials, it is started and killed again). Then the same command finishes the sweep, and every
+table and every lane's file is compared byte by byte. The exit status is 1 if a file differs.
 """
 
 import argparse
@@ -38,7 +38,7 @@ def run(
     more: list[str],
     kill_after: float | None = None,
 ) -> bool:
-    """Run the sweep; whether it was killed."""
+    """Run the sweep; return whether it was killed."""
     with subprocess.Popen(
         command(out, more),
         env=environment,
@@ -75,7 +75,7 @@ def main(arguments: list[str] | None = None) -> int:
             "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
             **os.environ,
         }
-        if not options.quick:  # so that `life` has no compiling in it
+        if not options.quick:  # so that `life` does not include compilation
             run(root / "warm", environment, more)
         began = time.perf_counter()
         run(root / "whole", environment, more)

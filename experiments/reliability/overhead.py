@@ -1,11 +1,11 @@
-"""What do checkpoints cost at the default interval?
+"""Measures the overhead of checkpoints at the default interval.
 
 Usage: python experiments/reliability/overhead.py [--quick]
 
-Writes the checkpoint of a full-sized lane (H = 128, pendulum) several times and takes the median.
-While five seeds of a cell are trained on two cores, each writes one per interval, and its core
-waits for it: the overhead is 5 × seconds / (2 × interval), where the interval is five minutes or
-150 times what a checkpoint takes.
+The script writes the checkpoint of a full-size lane (H = 128, pendulum) several times and takes the
+median time. If five seeds of a cell are trained on two cores, each writes a checkpoint per
+interval, and its core waits: the overhead is 5 × seconds / (2 × interval), where the interval is
+five minutes, or 150 times the time of a checkpoint.
 """
 
 import argparse
@@ -24,7 +24,7 @@ LANES, CORES = 5, 2
 
 
 def seconds_to_write(algorithm: str, capacity: int, repeats: int) -> tuple[float, float]:
-    """Median seconds of a checkpoint, and its MiB."""
+    """Median seconds of a checkpoint, and its size in MiB."""
     config = rtd.Config(algorithm=algorithm, total_steps=capacity)
     (job,) = make_jobs(rtd.make("pendulum", "random-sine"), config, [0])
     state = jax.jit(job.program.init)(job.lane)

@@ -1,12 +1,12 @@
-"""Are the numbers of two checkouts the same, to the bit?
+"""Compares the results of two checkouts bit by bit.
 
 Usage: python experiments/reliability/same_numbers.py OTHER [--quick] [--env rover] [--agents A ...]
 
-OTHER is the directory of another checkout, such as `git worktree add /tmp/other COMMIT` makes. Each
-checkout trains the agents in a process of its own, with the settings of the preset `quick` for
-fewer steps; then the learning curves and all parameters of the actors are compared. Agents act in
-half ranges since version 0.2, so that only environments whose actions are within 1, such as the
-rover, give the same numbers before and after.
+OTHER is the directory of another checkout, for example of `git worktree add /tmp/other COMMIT`.
+Each checkout trains the agents in its own process, with the settings of the preset `quick` and
+fewer steps. Then the learning curves and all parameters of the actors are compared. Agents act in
+half ranges since version 0.2, so only environments whose actions are within 1, such as the rover,
+give the same results before and after this version.
 """
 
 import argparse
@@ -43,7 +43,7 @@ np.savez(out, **arrays)
 
 
 def trained(checkout: pathlib.Path, out: pathlib.Path, arguments: list[str]) -> dict:
-    """The arrays that ``checkout`` gives."""
+    """Train with ``checkout``; return its arrays."""
     environment = {**os.environ, "PYTHONPATH": str(checkout)}
     command = [sys.executable, "-c", TRAIN, str(out), *arguments]
     subprocess.run(command, cwd=out.parent, env=environment, check=True)
@@ -73,7 +73,7 @@ def main(arguments: list[str] | None = None) -> int:
         unlike = [n for n in own if not np.array_equal(here[n], there[n], equal_nan=True)]
         different += bool(unlike)
         farthest = max((float(np.nanmax(np.abs(here[n] - there[n]))) for n in unlike), default=0.0)
-        verdict = f"differ by up to {farthest:.3g} in {unlike}" if unlike else "the same to the bit"
+        verdict = f"differ by up to {farthest:.3g} in {unlike}" if unlike else "bit-identical"
         print(f"{agent:20} {len(own)} arrays: {verdict}")
     return int(different > 0)
 

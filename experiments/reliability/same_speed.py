@@ -1,13 +1,13 @@
-"""Is this checkout as fast as another one? Whole training steps and compiling, taken in turns.
+"""Compares the speed of two checkouts: whole training steps, and compilation.
 
 Usage: python experiments/reliability/same_speed.py OTHER [--quick] [--agents A ...]
                                                     [--lengths L ...] [--rounds N] [--seconds S]
 
-OTHER is the directory of another checkout, such as `git worktree add /tmp/other COMMIT` makes. Each
-has a process of its own, with the benchmark's lanes: one for each core, width 128, batch 100, on
-the rover. They take turns, and every ratio is of neighbours in time; the table has the median and
-the quartiles of the time here over the time there. Compiling is timed once, without JAX's
-persistent cache.
+OTHER is the directory of another checkout, for example of `git worktree add /tmp/other COMMIT`.
+Each checkout has its own process, with the lanes of the benchmark: one for each core, width 128,
+batch 100, on the rover. They are measured alternately, and each ratio is computed from measurements
+that follow each other. The table has the median and the quartiles of the time here divided by the
+time there. The compilation is measured once, without JAX's persistent cache.
 """
 
 import argparse
@@ -35,7 +35,7 @@ for _ in sys.stdin:
 
 
 class Worker:
-    """A checkout's process, idle unless asked."""
+    """The process of a checkout, which is idle between measurements."""
 
     def __init__(self, checkout: pathlib.Path, arguments: list[str]):
         environment = {**os.environ, "PYTHONPATH": str(checkout)}
@@ -51,14 +51,14 @@ class Worker:
         self.compiling = self._answer()
 
     def step(self) -> float:
-        """Seconds of a step, measured now."""
+        """Measure the seconds of a step."""
         assert self._process.stdin is not None
         self._process.stdin.write("\n")
         self._process.stdin.flush()
         return self._answer()
 
     def end(self) -> None:
-        """Let the process go."""
+        """End the process."""
         assert self._process.stdin is not None
         self._process.stdin.close()
         self._process.wait()
@@ -67,14 +67,14 @@ class Worker:
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
         if not line:
-            raise SystemExit("a checkout's process ended; its error stands above")
+            raise SystemExit("the process of a checkout ended; see its error above")
         return float(line)
 
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("other", type=pathlib.Path)
-    parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
+    parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
     parser.add_argument("--agents", nargs="+", default=["lstm-td3-1ha1hc", "td3", "h-td3"])
     parser.add_argument("--lengths", nargs="+", type=int, default=[1, 20])
     parser.add_argument("--rounds", type=int, default=11)
