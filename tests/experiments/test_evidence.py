@@ -165,12 +165,12 @@ def test_the_pendulum_experiment_runs(tmp_path, capsys, monkeypatch):
     assert (out / "pendulum.png").stat().st_size > 5_000
     assert (out / "pendulum_learning_curves.svg").stat().st_size > 5_000
     said = capsys.readouterr().out
-    assert "0 of 2 cells stand in" in said and "not run" in said and "†" not in said
+    assert "has 0 of 2 cells" in said and "not run" in said and "†" not in said
 
     # What stands in the table is not trained again, wherever it was trained.
     elsewhere = tmp_path / "elsewhere"
     assert pendulum.main([*quick, "--run", str(elsewhere)]) == 1
-    assert "2 of 2 cells stand in" in capsys.readouterr().out and not elsewhere.exists()
+    assert "has 2 of 2 cells" in capsys.readouterr().out and not elsewhere.exists()
 
     # Without a finished lane of random-sine there is nothing to carry over, and that is said.
     lanes = run / "lanes"
