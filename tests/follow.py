@@ -1,4 +1,4 @@
-"""A plant whose task is the same in every unit of its actions and its sensors."""
+"""A plant whose task is the same in all units of its actions and its sensors."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Policies with random weights, large enough that a wrong gate or token would show."""
+"""Policies with random weights, large enough that a wrong gate or token has an effect."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Data flows one way: no import runs against the order of the layers."""
+"""Tests that imports follow the order of layers."""
 
 import ast
 import pathlib

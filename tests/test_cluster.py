@@ -1,4 +1,4 @@
-"""Several processes of a job, and what a Ray cluster is asked for."""
+"""Tests of several processes in a job, and of the requests to a Ray cluster."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Impossible configurations end in one line that names the field."""
+"""Tests that impossible configurations raise one line with the name of the field."""
 
 import dataclasses
 import math

@@ -1,4 +1,4 @@
-"""``python -m rtd3jax.export`` and the policies of a run directory."""
+"""Tests of ``python -m rtd3jax.export`` and the policies of a run directory."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""The Python of the README and of docs/ runs as it stands."""
+"""Runs the Python code of the README and of docs/."""
 
 import pathlib
 import re

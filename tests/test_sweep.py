@@ -1,4 +1,4 @@
-"""The command: what it writes, what it refuses, and that it goes on where it stopped."""
+"""Tests of the sweep's command: its files, its errors, and its continuation."""
 
 import json
 

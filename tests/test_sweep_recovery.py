@@ -1,4 +1,4 @@
-"""What ends a sweep, and what is found afterwards."""
+"""Tests of interrupted sweeps."""
 
 import contextlib
 import json

@@ -1,4 +1,4 @@
-"""What users add from outside: an agent, a memory, a learner; each trains, sweeps and leaves."""
+"""Tests of user extensions: an agent, a memory and a learner are trained, swept and exported."""
 
 import dataclasses
 

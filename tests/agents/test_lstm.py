@@ -1,4 +1,4 @@
-"""The LSTM's fast path against the obvious one."""
+"""Compares the fast LSTM with the straightforward one."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Every memory keeps to the interface: masks, resets, gradients, and one step at a time."""
+"""Tests of the interface of every memory: masks, resets, gradients, and single steps."""
 
 import jax
 import jax.numpy as jnp

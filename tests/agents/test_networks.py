@@ -1,4 +1,4 @@
-"""The six agents' networks against the paper's tables and an independent numpy version."""
+"""Compares the six agents' networks with the paper's tables and a separate numpy version."""
 
 import jax
 import jax.numpy as jnp

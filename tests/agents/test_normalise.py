@@ -1,4 +1,4 @@
-"""Observations in running deviations: the statistics, and that no unit of a sensor matters."""
+"""Tests of normalised observations: the statistics, and independence of a sensor's unit."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""bfloat16 products round their factors, and nothing else."""
+"""Tests that bfloat16 products only round their factors."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Every sampled window, mask, next window and stored carry, against a slow numpy oracle."""
+"""Compares sampled windows, masks, next windows and stored carries with a slow numpy oracle."""
 
 import jax
 import jax.numpy as jnp

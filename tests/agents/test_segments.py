@@ -1,4 +1,4 @@
-"""Segments against the windows' own code: targets, losses and gradients of every agent."""
+"""Compares segments with windows: targets, losses and gradients of every agent."""
 
 import dataclasses
 import functools

@@ -1,4 +1,4 @@
-"""Targets, losses and updates against the formulas written out."""
+"""Compares targets, losses and updates with the formulas."""
 
 import jax
 import jax.numpy as jnp

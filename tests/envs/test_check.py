@@ -1,4 +1,4 @@
-"""One environment that is broken in one way, for every finding; and sound ones that pass."""
+"""Tests every finding with an environment that has one error; correct environments pass."""
 
 import re
 

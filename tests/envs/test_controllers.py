@@ -1,4 +1,4 @@
-"""Controllers as policies: against oracles in numpy and scipy, and on the plants."""
+"""Compares controllers with oracles in numpy and scipy, and tests them on the plants."""
 
 import jax
 import jax.numpy as jnp

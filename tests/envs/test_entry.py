@@ -1,4 +1,4 @@
-"""What is no gymnax environment is refused in one line with the remedy, wherever it is given."""
+"""Tests that every function refuses anything but a gymnax environment in one line."""
 
 import gymnasium
 import gymnax

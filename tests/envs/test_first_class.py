@@ -1,4 +1,4 @@
-"""An environment from outside has all that ours have: this one file adds it."""
+"""Tests that a user's environment has all features of the package's environments."""
 
 import json
 import re

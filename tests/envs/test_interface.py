@@ -1,4 +1,4 @@
-"""What describe accepts and refuses, and that every refusal is one clear line."""
+"""Tests which environments `describe` accepts, and that every refusal is one clear line."""
 
 from typing import ClassVar
 

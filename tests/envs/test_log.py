@@ -1,4 +1,4 @@
-"""Logs are read without gaps, and whatever is wrong with them is one line."""
+"""Tests that logs are read without gaps, and that every error is one line."""
 
 import numpy as np
 import pandas as pd

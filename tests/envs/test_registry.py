@@ -1,4 +1,4 @@
-"""Environments by name; what is static and what is not."""
+"""Tests of environments by name, and of their static parts."""
 
 import functools
 import itertools

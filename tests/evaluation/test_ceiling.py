@@ -1,4 +1,4 @@
-"""The rover's best policy: exact moments, exact inference, and nothing nearby does better."""
+"""Tests the rover's optimal policy: moments, inference, and comparison with its neighbours."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Episodes to look at: the numbers are those of the evaluation, the names those of the drawing."""
+"""Tests that the steps of episodes agree with the evaluation, and their names."""
 
 import jax
 import numpy as np

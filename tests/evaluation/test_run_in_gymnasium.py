@@ -1,4 +1,4 @@
-"""A policy from here plays Gymnasium's own pendulum as it plays ours."""
+"""Tests that a policy has equal returns on Gymnasium's pendulum and on ours."""
 
 import gymnasium
 import jax

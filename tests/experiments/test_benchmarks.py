@@ -1,4 +1,4 @@
-"""The benchmarks run, in their quick form."""
+"""Runs the benchmarks with --quick."""
 
 import csv
 import importlib

@@ -1,4 +1,4 @@
-"""The experiments run in their quick form, and the verdicts follow from the numbers."""
+"""Runs the experiments with --quick, and tests the verdicts."""
 
 import shutil
 import sys

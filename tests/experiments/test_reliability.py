@@ -1,4 +1,4 @@
-"""The longer experiments run, in their quick form."""
+"""Runs the longer experiments with --quick."""
 
 import importlib.util
 import pathlib

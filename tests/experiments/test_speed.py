@@ -1,4 +1,4 @@
-"""The benchmarks run in their quick form, resume, and report what was measured."""
+"""Runs the benchmarks with --quick, and tests their resume and their reports."""
 
 import json
 import re

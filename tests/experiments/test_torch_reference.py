@@ -1,4 +1,4 @@
-"""The PyTorch reference does what rtd3jax does: same weights and batch in, same weights out."""
+"""Compares the PyTorch reference with rtd3jax for equal weights and batches."""
 
 import functools
 

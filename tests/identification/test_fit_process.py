@@ -1,4 +1,4 @@
-"""Processes with known parameters are simulated by themselves, fitted, and found again."""
+"""Fits processes to simulated logs with known parameters."""
 
 import math
 

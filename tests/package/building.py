@@ -1,4 +1,4 @@
-"""Build the wheel and the sdist of a copy of the project, offline and without traces in it."""
+"""Builds the wheel and the sdist of a copy of the project, offline."""
 
 import pathlib
 import shutil

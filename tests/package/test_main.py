@@ -1,4 +1,4 @@
-"""``python -m rtd3jax`` says all that there is, in any terminal."""
+"""Tests that ``python -m rtd3jax`` lists everything, in any terminal."""
 
 import io
 import pathlib

@@ -1,4 +1,4 @@
-"""What is built from the repository is whole, holds nothing else, and works where it is not."""
+"""Tests that the built packages are complete, and work outside the repository."""
 
 import email
 import os

@@ -1,4 +1,4 @@
-"""The documentation's site builds without a warning or a network, and its links resolve."""
+"""Tests that the site builds without warnings and network, and that its links are valid."""
 
 import importlib.util
 import json

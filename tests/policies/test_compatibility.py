@@ -1,4 +1,4 @@
-"""A policy and an environment of other shapes never give a number; other bounds are said."""
+"""Tests that a policy with other shapes is refused, and that other bounds give a warning."""
 
 import warnings
 

@@ -1,4 +1,4 @@
-"""Saved policies: the same bits come back, and what is not one is refused in one line."""
+"""Tests that saved policies are restored bit by bit, and that bad files are refused."""
 
 import json
 

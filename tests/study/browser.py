@@ -1,4 +1,4 @@
-"""A headless Chromium for the tests of the page, or the reason for having none."""
+"""A headless Chromium for the tests of the page; without one, a test is skipped."""
 
 import contextlib
 import shutil

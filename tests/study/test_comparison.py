@@ -1,4 +1,4 @@
-"""Runs beside each other: against oracles by hand, and the command on runs of untrained agents."""
+"""Compares the comparison of runs with results by hand, and tests its command."""
 
 import re
 

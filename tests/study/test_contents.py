@@ -1,4 +1,4 @@
-"""A configuration that cannot be read says why."""
+"""Tests the error messages of configurations that cannot be read."""
 
 import json
 

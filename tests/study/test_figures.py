@@ -1,4 +1,4 @@
-"""Contracts of the figures, checked on the drawn axes and the written files."""
+"""Tests figures by the drawn axes and the written files."""
 
 import numpy as np
 import pandas as pd

@@ -1,4 +1,4 @@
-"""Locks on systems and file systems that have others than flock, or none."""
+"""Tests locks on systems and file systems without flock."""
 
 import errno
 import os

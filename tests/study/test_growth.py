@@ -1,4 +1,4 @@
-"""A study that grows: what was there stays to the bit, and what would change it is refused."""
+"""Tests additions to a study: existing files do not change, other changes are refused."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Each tracker gets every evaluation of every lane, without a network."""
+"""Tests that each tracker gets every evaluation of every lane, without a network."""
 
 import struct
 

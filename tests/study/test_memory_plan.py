@@ -1,4 +1,4 @@
-"""The memory plan against what XLA reserves, and how lanes are split when they do not fit."""
+"""Compares the memory plan with XLA's reservations, and tests the split of lanes."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""A plan's programs; the operations that it and the benchmark count are those that XLA counts."""
+"""Compares the operations of the plan and the benchmark with XLA's count."""
 
 import dataclasses
 import types

@@ -1,4 +1,4 @@
-"""The page of a run: what is in it, what it does in a browser, what it says is missing."""
+"""Tests the page of a run: its data, its behaviour in a browser, its notes."""
 
 import json
 import os

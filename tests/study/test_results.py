@@ -1,4 +1,4 @@
-"""Contracts of the Parquet result tables."""
+"""Tests of the Parquet tables."""
 
 import os
 

@@ -1,4 +1,4 @@
-"""Contracts of the statistics over seeds, against oracles written out by hand."""
+"""Compares the statistics over seeds with oracles by hand."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""A study from Python is the sweep's, file for file."""
+"""Tests that `Study` writes the same files as the sweep."""
 
 import pandas as pd
 import pytest

@@ -1,4 +1,4 @@
-"""Contracts of the Markdown summary."""
+"""Tests of the Markdown summary."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The time that a plan names is measured: of some programs, and in proportion of the others."""
+"""Tests the time estimate: some programs are measured, the others are interpolated."""
 
 import numpy as np
 import pytest

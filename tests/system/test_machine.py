@@ -1,4 +1,4 @@
-"""Other systems than Linux, and the limits of a job."""
+"""Tests on simulated other systems, and the limits of a job."""
 
 import os
 import pathlib

@@ -1,4 +1,4 @@
-"""Files as others meet them: modes, true reasons, home directories, UTF-8."""
+"""Tests of files: modes, reasons of errors, home directories, UTF-8."""
 
 import ast
 import io

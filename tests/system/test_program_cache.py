@@ -1,4 +1,4 @@
-"""Compiled programs are let go before there are too many mappings, and nothing else changes."""
+"""Tests that programs are removed before the limit of mappings, without other effects."""
 
 import jax
 import numpy as np

@@ -1,4 +1,4 @@
-"""JAX's own switches, as its users turn them on: each works, or one line says that it does not."""
+"""Tests of JAX's switches: each works, or is refused with one line."""
 
 import os
 import subprocess

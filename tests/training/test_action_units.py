@@ -1,4 +1,4 @@
-"""An agent learns the same whatever the unit and the centre of the environment's actions."""
+"""Tests that learning does not depend on the unit and the centre of actions."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""A lane that goes on from a checkpoint ends with the same bits; a bad checkpoint is named."""
+"""Tests bit-identical continuation from checkpoints, and messages about bad checkpoints."""
 
 import dataclasses
 

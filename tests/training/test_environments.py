@@ -1,4 +1,4 @@
-"""Several environments that feed one learner: each row belongs to one of them, and to its past."""
+"""Tests of several environments for one learner: each row belongs to one of them."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""A training that cannot train says so; one that makes a single update of the actor does not."""
+"""Tests warnings for configurations that will not train their networks."""
 
 import warnings
 

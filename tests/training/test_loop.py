@@ -1,4 +1,4 @@
-"""What a lane stores as it goes: boundaries, final observations, carries."""
+"""Tests the stored data of a lane: boundaries, final observations, carries."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Metrics of learning: averages over the steps between two evaluations, and nothing else."""
+"""Tests that metrics of learning are averages over the steps between two evaluations."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""An environment that the library does not know, with real terminations, trains as it is."""
+"""Trains on an environment outside the package, with terminations."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""What is refused of segments and of acting with a carry, in one line and before compilation."""
+"""Tests that impossible settings of segments and carries are refused before compilation."""
 
 import warnings
 

@@ -1,4 +1,4 @@
-"""Training that goes on from a policy or a checkpoint, with parts that stay or wait."""
+"""Tests training from a policy or a checkpoint, with frozen and delayed parts."""
 
 import dataclasses
 import shutil

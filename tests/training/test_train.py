@@ -1,4 +1,4 @@
-"""The trainer's contracts: determinism, independence of lanes, lengths side by side."""
+"""Tests of the trainer: determinism, independence of lanes, common history lengths."""
 
 import dataclasses
 import types

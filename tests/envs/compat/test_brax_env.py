@@ -1,4 +1,4 @@
-"""The adapter against a small environment in Brax's style, and against MuJoCo Playground."""
+"""Tests the adapter with a small environment with Brax's interface, and MuJoCo Playground."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Our environments under Gymnasium's own checker, and by its rules about ends and seeds."""
+"""Tests our environments with Gymnasium's checker, and its rules about ends and seeds."""
 
 import gc
 import subprocess

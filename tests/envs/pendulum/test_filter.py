@@ -1,4 +1,4 @@
-"""The reference's belief is that of brute force, and what it earns is what such a belief allows."""
+"""Compares the filter's belief with brute force, and tests the returns of its policy."""
 
 import jax
 import jax.numpy as jnp

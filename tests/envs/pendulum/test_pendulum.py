@@ -1,4 +1,4 @@
-"""The pendulum against Gymnasium's, and its reward as a function of the observation."""
+"""Compares the pendulum with Gymnasium's, and tests its reward for an observation."""
 
 import functools
 

@@ -1,4 +1,4 @@
-"""The pendulum's ceiling: converged on its grid, and reached by acting greedily upon it."""
+"""Tests the pendulum's ceiling: it has converged, and the greedy policy reaches it."""
 
 import jax
 import jax.numpy as jnp

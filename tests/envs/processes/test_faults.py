@@ -1,4 +1,4 @@
-"""Faults against slow numpy oracles, on every channel; and that they begin anew with episodes."""
+"""Compares faults with slow numpy oracles, on every channel, and tests their reset."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Recorded disturbances against the rows that were recorded."""
+"""Compares replayed disturbances with the recorded rows."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""The rover against a numpy oracle, and the facts of the paper that can be checked."""
+"""Compares the rover with a numpy oracle, and with facts in the paper."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""What the exported files are, and what is refused."""
+"""Tests the contents of exported files, and refused files."""
 
 import ast
 import json

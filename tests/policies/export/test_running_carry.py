@@ -1,4 +1,4 @@
-"""A carry that runs on from the episode's start: what it equals in every form, and its size."""
+"""Tests running carries in every export format, and the size of their state."""
 
 import jax
 import jax.numpy as jnp
