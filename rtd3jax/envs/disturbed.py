@@ -319,7 +319,7 @@ def seen_elements(env: EnvironmentLike, params: Any, size: int) -> list[int]:
 
 
 def _left(process: Process, elements: list[int]) -> list[int]:
-    """Those of ``elements`` that ``process`` does not remove."""
+    """The ``elements`` that ``process`` does not remove."""
     if isinstance(process, Hidden):
         return [*elements[: process.element], *elements[process.element + 1 :]]
     if isinstance(process, Chain):
@@ -327,7 +327,7 @@ def _left(process: Process, elements: list[int]) -> list[int]:
             elements = _left(part, elements)
     if isinstance(process, Mixture):
         each = [_left(member, elements) for member in process.processes]
-        # Members that remove different elements leave columns without one meaning.
+        # If members remove different elements, the columns have no unique meaning.
         return each[0] if all(left == each[0] for left in each) else []
     return elements
 

@@ -342,9 +342,7 @@ def _disturbed(env_id: str, entry: _Entry, disturbance: str, parameters: dict[st
     mixture = (Mixture(),) if len(alternatives) > 1 else ()
     if mixture:
         _check_one_channel(what, channels, processes)
-    *assigned, params = _assign(
-        what, (*processes, *mixture, base.default_params), rest, also
-    )
+    *assigned, params = _assign(what, (*processes, *mixture, base.default_params), rest, also)
     processes = tuple(assigned[: len(names)])
     for process in processes:
         process.validate()
@@ -392,16 +390,16 @@ def _check_owners(
 def _check_one_channel(
     what: str, channels: tuple[str, ...], processes: tuple[Process, ...]
 ) -> None:
-    """Raise UserError for alternatives that do not all disturb the same thing.
+    """Raise UserError for alternatives that disturb different channels.
 
-    Each channel would draw its own kind, and an episode would mix parts of several alternatives.
+    Each channel would draw separately, so an episode would combine parts of several alternatives.
     """
     pairs = zip(channels, processes, strict=True)
     disturbed = {channel for channel, process in pairs if not isinstance(process, NoDisturbance)}
     if len(disturbed) > 1:
         raise UserError(
-            f"{what}: alternatives must all disturb the same thing, not the "
-            f"{' and the '.join(sorted(disturbed))}; train on each of them by itself"
+            f"{what}: alternatives must disturb the same channel, not the "
+            f"{' and the '.join(sorted(disturbed))}; train on each of them separately"
         )
 
 

@@ -1,4 +1,4 @@
-"""Several kinds of disturbance in one training: each episode draws one of them."""
+"""A mixture of disturbances: each episode draws one of them."""
 
 import jax
 import jax.numpy as jnp
@@ -9,26 +9,26 @@ from rtd3jax.errors import UserError
 
 
 class MixtureState(struct.PyTreeNode):
-    """An episode's kind, and the state of every member: those that do not act evolve unseen."""
+    """The drawn member of an episode, and the states of all members, which all evolve."""
 
     kind: jax.Array
-    """int32 []: which member acts throughout this episode"""
+    """int32 []: index of the member that acts in this episode"""
     members: tuple
 
 
 class Mixture(Process):
-    """One of several processes, drawn when an episode begins; it acts throughout the episode.
+    """One of several processes, which is drawn at the start of an episode and acts in all of it.
 
-    The agent is not told which one it is. Each member has its own random stream. All members must
-    make signals of the same number of elements.
+    The agent does not observe which process was drawn. Each member has its own random stream. The
+    outputs of all members must have the same number of elements.
     """
 
     processes: tuple[Process, ...] = ()
     weights: tuple[int, ...] = struct.field(pytree_node=False, default=())
-    """How often each member is drawn, relative to the others; equally often if empty."""
+    """Relative frequency of each member; () means equal frequencies."""
 
     def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> MixtureState:
-        """Draw the kind and every member's state."""
+        """Draw a member, and the states of all members."""
         weights = self.weights or (1,) * len(self.processes)
         logits = jnp.log(jnp.asarray(weights, jnp.float32))
         kind = jax.random.categorical(jax.random.fold_in(key, len(self.processes)), logits)
@@ -41,8 +41,8 @@ class Mixture(Process):
     def step(
         self, key: jax.Array, state: MixtureState, signal: jax.Array
     ) -> tuple[jax.Array, MixtureState]:
-        """What the drawn member makes of the signal."""
-        # Under vmap every branch of a switch is computed anyway, and a step costs little.
+        """The output of the drawn member."""
+        # Not a switch: under vmap, all its branches are computed too, and a step takes little time.
         stepped = [
             process.step(jax.random.fold_in(key, index), inner, signal)
             for index, (process, inner) in enumerate(
@@ -53,7 +53,7 @@ class Mixture(Process):
         return signals[state.kind], state.replace(members=tuple(inner for _, inner in stepped))
 
     def output_size(self, size: int) -> int:
-        """The size that every member makes; UserError where they differ."""
+        """The common output size of all members; raises UserError if the sizes differ."""
         sizes = [process.output_size(size) for process in self.processes]
         if len(set(sizes)) > 1:
             each = ", ".join(
@@ -61,7 +61,7 @@ class Mixture(Process):
                 for process, count in zip(self.processes, sizes, strict=True)
             )
             raise UserError(
-                f"Mixture: its members leave different numbers of elements ({each}), which one "
+                f"Mixture: the outputs of its members have different sizes ({each}), which an "
                 "agent cannot read; hide the same elements in every member"
             )
         return sizes[0]
@@ -69,11 +69,11 @@ class Mixture(Process):
     def validate(self) -> None:
         """Check the weights and every member."""
         if not self.processes:
-            raise UserError("Mixture has no members: give it processes=(process, process, ...)")
+            raise UserError("Mixture has no members: pass processes=(process, process, ...)")
         if self.weights and len(self.weights) != len(self.processes):
             raise UserError(
-                f"Mixture: {len(self.weights)} weights for {len(self.processes)} members; give "
-                "one for each, or none"
+                f"Mixture: {len(self.weights)} weights for {len(self.processes)} members; pass "
+                "one for each member, or none"
             )
         if any(weight < 0 for weight in self.weights) or (self.weights and not any(self.weights)):
             raise UserError(

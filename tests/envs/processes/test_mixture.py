@@ -109,7 +109,7 @@ def test_directories_tell_a_mixture_from_other_names():
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (lambda: rtd.make("pendulum", "noise/action-delay"), "disturb the same thing, not the act"),
+        (lambda: rtd.make("pendulum", "noise/action-delay"), "disturb the same channel, not the act"),
         (lambda: rtd.make("pendulum", "noise/hidden"), "different numbers of elements"),
         (lambda: rtd.make("pendulum", "noise/"), "unknown disturbance ''"),
         (lambda: rtd.make("pendulum", "noise/hidden+"), "unknown disturbance ''"),
