@@ -285,7 +285,7 @@ def from_arrays(
     names = [jax.tree_util.keystr(path) for path, _ in leaves]
     if set(names) != set(arrays):
         odd = sorted(set(names) ^ set(arrays))[0]
-        raise UserError(f"{file} does not fit this agent: array {odd} is missing or too many")
+        raise UserError(f"{file} does not fit this agent: array {odd} is missing or unexpected")
     return jax.tree.unflatten(
         structure,
         [_from_array(arrays[n], leaf, n, file) for n, (_, leaf) in zip(names, leaves, strict=True)],
@@ -302,7 +302,7 @@ def leaves_from_arrays(expected: Any, arrays: dict[str, np.ndarray], place: str,
     named = [(place + jax.tree_util.keystr(path), leaf) for path, leaf in leaves]
     there = {name for name in arrays if name.startswith((f"{place}.", f"{place}["))}
     if odd := sorted(there ^ {name for name, _ in named}):
-        raise UserError(f"{file} does not fit this agent: array {odd[0]} is missing or too many")
+        raise UserError(f"{file} does not fit this agent: array {odd[0]} is missing or unexpected")
     return jax.tree.unflatten(
         structure, [_from_array(arrays[name], leaf, name, file) for name, leaf in named]
     )

@@ -109,14 +109,20 @@ def test_directories_tell_a_mixture_from_other_names():
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (lambda: rtd.make("pendulum", "noise/action-delay"), "disturb the same channel, not the act"),
-        (lambda: rtd.make("pendulum", "noise/hidden"), "different numbers of elements"),
+        (
+            lambda: rtd.make("pendulum", "noise/action-delay"),
+            "disturb the same channel, not the act",
+        ),
+        (lambda: rtd.make("pendulum", "noise/hidden"), "have different sizes"),
         (lambda: rtd.make("pendulum", "noise/"), "unknown disturbance ''"),
         (lambda: rtd.make("pendulum", "noise/hidden+"), "unknown disturbance ''"),
         (lambda: rtd.make("pendulum", "noise/random-sine", weights=(1,)), "1 weights for 2"),
         (lambda: rtd.make("pendulum", "noise/random-sine", weights=(0, 0)), "must be positive"),
         (lambda: rtd.make("pendulum", "noise", weights=(1, 2)), "no parameter 'weights'"),
-        (lambda: rtd.make("pendulum", "noise/noise", sigma=1.0), "could be that of noise or noise"),
+        (
+            lambda: rtd.make("pendulum", "noise/noise", sigma=1.0),
+            "is a parameter of noise and of noise",
+        ),
         (lambda: rtd.make("pendulum", "noise/random-sine", sigma=-1.0), "sigma"),
         (lambda: rtd.disturb(rtd.make("rover"), rtd.Mixture()), "no members"),
     ],
