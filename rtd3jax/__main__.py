@@ -9,7 +9,7 @@ import sys
 import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 
-from rtd3jax.cli.common import show_what_can_be_shown
+from rtd3jax.cli.common import replace_unprintable
 from rtd3jax.envs.builtin import DISTURBANCES
 from rtd3jax.envs.registry import FAULTS
 from rtd3jax.registries import AGENTS, MEMORIES
@@ -25,7 +25,7 @@ _MARK = "``python -m rtd3jax."
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; the exit status: 0 done, 2 bad input."""
-    show_what_can_be_shown()
+    replace_unprintable()
     parser = argparse.ArgumentParser(
         prog="python -m rtd3jax",
         description="List what this installation of rtd3jax offers, by name.",

@@ -9,7 +9,7 @@ from typing import Any
 from rtd3jax.errors import UserError
 
 
-def show_what_can_be_shown() -> None:
+def replace_unprintable() -> None:
     """Print "?" for a letter that the terminal cannot show, so that no run ends by an error."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -54,7 +54,7 @@ def run_parser(
     name: str, description: str | None, example: str, what: str = "a run directory"
 ) -> argparse.ArgumentParser:
     """The parser of a command that reads a run directory: it has ``run`` and ``--import``."""
-    show_what_can_be_shown()
+    replace_unprintable()
     parser = argparse.ArgumentParser(
         prog=f"python -m rtd3jax.{name}",
         description=description,

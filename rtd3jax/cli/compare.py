@@ -7,7 +7,7 @@ prints a Markdown table; with --out DIR it also writes DIR/compare.parquet and D
 import argparse
 from collections.abc import Sequence
 
-from rtd3jax.cli.common import exit_status, show_what_can_be_shown
+from rtd3jax.cli.common import exit_status, replace_unprintable
 from rtd3jax.errors import UserError
 from rtd3jax.study.comparison import MEASURES, compare_runs, comparison_markdown, differing_settings
 from rtd3jax.study.rundir import RunDirectory
@@ -49,7 +49,7 @@ def _short_names(paths: list[str]) -> list[str]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    show_what_can_be_shown()
+    replace_unprintable()
     parser = argparse.ArgumentParser(
         prog="python -m rtd3jax.compare",
         description=__doc__,

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 import jax
 
 from rtd3jax.agents.variants import ALGORITHMS
-from rtd3jax.cli.common import add_import, show_what_can_be_shown
+from rtd3jax.cli.common import add_import, replace_unprintable
 from rtd3jax.config import Config
 from rtd3jax.envs.builtin import DISTURBANCES, ENVIRONMENTS
 from rtd3jax.errors import UserError
@@ -30,7 +30,7 @@ class _Parser(argparse.ArgumentParser):
 
 def parser(description: str | None) -> argparse.ArgumentParser:
     """The command line of ``rtd3jax.sweep``; bad input raises `UserError`."""
-    show_what_can_be_shown()
+    replace_unprintable()
     environments = "\n".join(f"  {env}: {', '.join(DISTURBANCES[env])}" for env in ENVIRONMENTS)
     found = _Parser(
         prog="python -m rtd3jax.sweep",

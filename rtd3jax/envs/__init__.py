@@ -1,3 +1,3 @@
 """Environments, and the hidden processes that disturb them."""
 
-import rtd3jax.envs.builtin  # noqa: F401  (registers ours)
+import rtd3jax.envs.builtin  # noqa: F401  (registers the paper's environments)

@@ -342,7 +342,7 @@ def _time_limits(record: _Record, limit: int | None, steps: int) -> Iterator[Fin
     elif known and (record.length > longest).any():
         yield Finding(
             "time-limit",
-            f"an episode goes on after params.max_steps_in_episode = {longest} steps",
+            f"an episode continues after params.max_steps_in_episode = {longest} steps",
             "count the steps in state.time, which gymnax's is_truncated reads",
         )
     elif (record.length == 1).all() and not terminated.any():
@@ -367,7 +367,7 @@ def _final_observations(record: _Record) -> Iterator[Finding]:
     if not same[inside].all():
         yield Finding(
             "final-observation",
-            "info['final_observation'] differs from the observation though the episode goes on",
+            "info['final_observation'] differs from the observation during an episode",
             "return the observation before the automatic reset, at every step",
         )
     elif done.any() and moving and same[done].all():

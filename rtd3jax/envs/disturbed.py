@@ -135,7 +135,7 @@ class Disturbed(ValueIdentity, environment.Environment):
         self, key: jax.Array, params: DisturbedParams
     ) -> tuple[jax.Array, DisturbedState]:
         """Start an episode and all processes; returns the first observation [O] and the state."""
-        return self._begun(key, *self.undisturbed_reset(key, params), params)
+        return self._begin_episode(key, *self.undisturbed_reset(key, params), params)
 
     def reset_where(
         self, where: jax.Array, key: jax.Array, state: DisturbedState, params: DisturbedParams
@@ -143,7 +143,7 @@ class Disturbed(ValueIdentity, environment.Environment):
         """As `reset_env`, for a simulator, which is reset only if ``where`` is true."""
         key_env, _, _ = jax.random.split(key, 3)
         first, env = self.base.reset_where(where, key_env, state.env, params.env)
-        return self._begun(key, first, env, params)
+        return self._begin_episode(key, first, env, params)
 
     def step(
         self, key: jax.Array, state: object, action: ArrayLike, params: object = None
@@ -154,7 +154,7 @@ class Disturbed(ValueIdentity, environment.Environment):
         params = self.default_params if params is None else params
         return step_with_reset(self, key, state, action, params)
 
-    def _begun(
+    def _begin_episode(
         self, key: jax.Array, true_observation: jax.Array, env: object, params: DisturbedParams
     ) -> tuple[jax.Array, DisturbedState]:
         """The first observation and state, from those of the wrapped environment."""

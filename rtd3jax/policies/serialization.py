@@ -50,7 +50,7 @@ def read_policy(path: str | os.PathLike) -> Policy:
             f"{NORMALISED_FORMAT}: use the version that wrote the file, or a newer version"
         )
     interface, facts = _header(path, metadata)
-    normaliser = below(arrays, "normaliser")
+    normaliser = under_prefix(arrays, "normaliser")
     if (metadata["format"] == NORMALISED_FORMAT) != bool(normaliser):
         raise UserError(f"{path} is damaged: its arrays do not agree with its format")
     actor = {name: array for name, array in arrays.items() if not name.startswith("normaliser.")}
@@ -135,7 +135,7 @@ def restore_policy(
     )
 
 
-def below(arrays: Mapping[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
+def under_prefix(arrays: Mapping[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
     """The arrays whose dotted names begin with ``name``, which is removed from the names."""
     return {n.removeprefix(f"{name}."): a for n, a in arrays.items() if n.startswith(f"{name}.")}
 

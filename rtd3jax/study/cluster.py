@@ -126,7 +126,7 @@ def _connected(ray: ModuleType, address: str) -> Iterator[None]:
     # all GPUs from a task that requests none.
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     try:
-        _knock(address)
+        _check_listening(address)
         ray.init(address=address, log_to_driver=False, logging_level="ERROR")
     except (OSError, ValueError, OverflowError, RuntimeError) as error:
         reason = first_line(error)
@@ -140,7 +140,7 @@ def _connected(ray: ModuleType, address: str) -> Iterator[None]:
         ray.shutdown()
 
 
-def _knock(address: str) -> None:
+def _check_listening(address: str) -> None:
     """Raise an error at once if nothing listens at ``address``: Ray would retry for minutes."""
     host, colon, port = address.rpartition("://")[2].rpartition(":")
     if colon:

@@ -72,7 +72,7 @@ class Contents:
 
     def lacks(self, asked: "Contents") -> bool:
         """Whether ``asked`` contains something that this study does not."""
-        return grown(self, asked) != self
+        return extended(self, asked) != self
 
 
 class _NotRegistered(UserError):
@@ -105,7 +105,7 @@ def read_config(config: Path) -> dict[str, Any]:
         raise UserError(f"{config} is not a study's configuration") from error
 
 
-def grown(there: Contents, asked: Contents) -> Contents:
+def extended(there: Contents, asked: Contents) -> Contents:
     """The contents ``there`` with the additions of ``asked``.
 
     Raises:
@@ -114,7 +114,7 @@ def grown(there: Contents, asked: Contents) -> Contents:
     if there.episodes != asked.episodes:
         raise UserError(f"final_episodes: {there.episodes} there, {asked.episodes} here")
     wanted = {_key(cell): cell for cell in asked.cells}
-    cells = [_larger(cell, wanted.pop(_key(cell), cell)) for cell in there.cells]
+    cells = [_with_more_steps(cell, wanted.pop(_key(cell), cell)) for cell in there.cells]
     stages = there.stages
     if wanted:
         cells, stages = [*cells, *wanted.values()], (*stages, len(cells))
@@ -128,7 +128,7 @@ def longer_cells(there: Contents, now: Contents) -> list[tuple[Cell, Cell]]:
     return [(before, after) for before, after in pairs if before != after]
 
 
-def what_was_added(there: Contents, now: Contents) -> str:
+def additions_text(there: Contents, now: Contents) -> str:
     """The additions in words, for a message of one line; empty without additions."""
     added = now.cells[len(there.cells) :]
     words = []
@@ -136,7 +136,9 @@ def what_was_added(there: Contents, now: Contents) -> str:
         words.append(f"seed{'s' * (len(seeds) > 1)} {_listed(list(map(str, seeds)))}")
     if added:
         one = f"{len(added)} cell{'s' * (len(added) > 1)}"
-        words.append(f"{one} ({_listed([cell_words(cell) for cell in added])}{_odd(there, added)})")
+        words.append(
+            f"{one} ({_listed([cell_words(cell) for cell in added])}{_unusual(there, added)})"
+        )
     for before, after in longer_cells(there, now):
         words.append(
             f"{after.config.total_steps:,} steps for {before.config.total_steps:,} of "
@@ -155,7 +157,7 @@ def _key(cell: Cell) -> tuple[Any, ...]:
     return tuple(cell.key.values())
 
 
-def _larger(there: Cell, asked: Cell) -> Cell:
+def _with_more_steps(there: Cell, asked: Cell) -> Cell:
     """``asked``, if it equals ``there`` with the same steps or more; else UserError."""
     before, after = there.to_dict(), asked.to_dict()
     longer = after["total_steps"] > before["total_steps"]
@@ -165,7 +167,7 @@ def _larger(there: Cell, asked: Cell) -> Cell:
     return asked
 
 
-def _odd(there: Contents, added: Sequence[Cell]) -> str:
+def _unusual(there: Contents, added: Sequence[Cell]) -> str:
     """Fields in which added cells differ from all earlier cells, perhaps by a forgotten flag."""
     old = [cell.to_dict() for cell in there.cells]
     words: dict[str, None] = {}

@@ -121,7 +121,7 @@ def _excerpt(directory: RunDirectory) -> dict[str, object]:
         if len({cell[name] for cell in dicts}) == 1:
             fields[name] = dicts[0][name]
         elif name not in directory.cells[0].key:  # fields of the key are in the summary's tables
-            fields[name] = _whose(name, dicts)
+            fields[name] = _values_and_owners(name, dicts)
     return {
         "cells": len(directory.cells),
         "seeds": len(directory.seeds),
@@ -140,7 +140,7 @@ def _began_from(directory: RunDirectory) -> dict[str, object]:
     return {"began from": "; ".join(found)} if found else {}
 
 
-def _whose(name: str, cells: Sequence[Mapping[str, Any]]) -> str:
+def _values_and_owners(name: str, cells: Sequence[Mapping[str, Any]]) -> str:
     """Each value of a field, followed by the environments or agents that have this value."""
     within: dict[str, set[Any]] = {}
     for cell in cells:

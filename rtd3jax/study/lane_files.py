@@ -13,7 +13,7 @@ import numpy as np
 
 from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
-from rtd3jax.policies.serialization import below, read_interface, restore_policy
+from rtd3jax.policies.serialization import read_interface, restore_policy, under_prefix
 from rtd3jax.policies.trained import FORMAT, Policy
 from rtd3jax.study.plan import Cell
 from rtd3jax.system.files import read_arrays, read_metadata, write_arrays, write_bytes_atomically
@@ -121,9 +121,9 @@ class LaneFiles:
             interface = describe(env, env.default_params)
         return restore_policy(
             path,
-            below(arrays, "actor"),
+            under_prefix(arrays, "actor"),
             interface,
-            normaliser=below(arrays, "normaliser"),
+            normaliser=under_prefix(arrays, "normaliser"),
             algorithm=cell.config.algorithm,
             history_length=cell.config.window_tokens,
             width=cell.config.hidden_size,

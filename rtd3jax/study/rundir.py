@@ -19,11 +19,11 @@ from rtd3jax.errors import UserError
 from rtd3jax.policies.trained import FORMAT
 from rtd3jax.study.contents import (
     Contents,
+    additions_text,
     cell_words,
-    grown,
+    extended,
     longer_cells,
     read_config,
-    what_was_added,
 )
 from rtd3jax.study.lane_files import LaneFiles, cell_name
 from rtd3jax.study.lock import writer
@@ -105,7 +105,7 @@ class RunDirectory:
             return ""
         there = Contents.read(config)
         try:
-            self.contents = grown(there, self._asked)
+            self.contents = extended(there, self._asked)
         except UserError as error:
             raise UserError(
                 f"--out {self.path} holds another study ({error}); "
@@ -114,8 +114,8 @@ class RunDirectory:
         self._check_longer(there)
         self._check_format(config)
         if self.contents != there:
-            return f"added to {self.path}: {what_was_added(there, self.contents)}"
-        if grown(self._asked, there) != self._asked:
+            return f"added to {self.path}: {additions_text(there, self.contents)}"
+        if extended(self._asked, there) != self._asked:
             return (
                 f"{self.path} holds more cells or seeds than this command names: all of its "
                 f"{len(there.cells)} cells × {len(there.seeds)} seeds are continued"
@@ -151,7 +151,7 @@ class RunDirectory:
             try:
                 with writer(self.path, None):
                     news, content = self.plan(), read_config(config)
-                    change = {"added": what_was_added(Contents.read(config), self.contents)}
+                    change = {"added": additions_text(Contents.read(config), self.contents)}
                     if change["added"]:
                         made = {**change, "made_with": _made_with()}
                         content["grown"] = [*content.get("grown", []), made]

@@ -26,7 +26,7 @@ _SECONDS = 2.0
 
 _caches: list[Callable[[], None]] = []
 _lock = threading.Lock()
-_looked = -_SECONDS
+_counted_at = -_SECONDS
 
 
 def on_full(empty: Callable[[], None]) -> Callable[[], None]:
@@ -44,11 +44,11 @@ def make_room() -> bool:
     Returns:
         whether the programs were removed.
     """
-    global _looked
+    global _counted_at
     with _lock:
-        if time.monotonic() - _looked < _SECONDS:
+        if time.monotonic() - _counted_at < _SECONDS:
             return False
-        _looked = time.monotonic()
+        _counted_at = time.monotonic()
         used, limit = _mappings()
         if used <= _SHARE * limit:
             return False

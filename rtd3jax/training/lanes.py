@@ -303,7 +303,7 @@ def _chunk(group: Group, device: jax.Device, rates: dict[Any, float]) -> None:
     program, width = group.jobs[0].program, len(group.jobs)
     lane = stacked([job.lane for job in group.jobs], device)
     init, advance = compiled(program, lane, width > 1, device)
-    state = _begun(group, init(lane)) if group.state is None else group.state
+    state = _with_start(group, init(lane)) if group.state is None else group.state
     state = jax.device_put(state, device)
     rate = rates.get((program, width))
     steps = _FIRST_CHUNK if rate is None else max(1, int(rate * CHUNK_SECONDS))
@@ -323,7 +323,7 @@ def _chunk(group: Group, device: jax.Device, rates: dict[Any, float]) -> None:
     _advanced(group, state, stop)
 
 
-def _begun(group: Group, state: LaneState) -> LaneState:
+def _with_start(group: Group, state: LaneState) -> LaneState:
     """The group's new ``state``, in which each lane gets the networks from which it starts."""
     if all(job.start is None for job in group.jobs):
         return state
@@ -373,7 +373,7 @@ _programs_lock = threading.Lock()
 
 
 @on_full
-def _let_go() -> None:
+def _remove_programs() -> None:
     """Remove all programs. A worker keeps the program that it is running; others compile again."""
     with _programs_lock:
         _programs.clear()

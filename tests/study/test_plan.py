@@ -16,7 +16,7 @@ from rtd3jax.agents.replay import empty_replay, gather, gather_segments
 from rtd3jax.agents.variants import ALGORITHMS
 from rtd3jax.config import Config
 from rtd3jax.registries import AGENTS
-from rtd3jax.study.derive import _whose
+from rtd3jax.study.derive import _values_and_owners
 from rtd3jax.study.plan import Grid, cell_jobs, make_cells, update_flops
 
 
@@ -124,5 +124,5 @@ def test_fields_in_which_cells_differ_have_their_owners():
     found = cells("rover", agents, gamma=0.0) + cells("pendulum", agents[:1], gamma=0.9)
     found += cells("pendulum", agents[1:], gamma=0.99)
     said = "0.0 (rover); 0.9 (pendulum: td3); 0.99 (pendulum: h-td3)"
-    assert _whose("gamma", found) == said
-    assert _whose("gamma", found[2:]) == "0.9 (td3); 0.99 (h-td3)"
+    assert _values_and_owners("gamma", found) == said
+    assert _values_and_owners("gamma", found[2:]) == "0.9 (td3); 0.99 (h-td3)"

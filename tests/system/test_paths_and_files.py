@@ -13,7 +13,7 @@ import pytest
 import rtd3jax
 import rtd3jax as rtd
 from rtd3jax.cli import sweep_options
-from rtd3jax.cli.common import show_what_can_be_shown
+from rtd3jax.cli.common import replace_unprintable
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.system.files import (
     read_arrays,
@@ -114,4 +114,4 @@ def test_the_terminal_gets_what_it_can_show(encoding, monkeypatch):
     sys.stdout.flush()
     assert shown.getvalue() == "3 × 2, ≥ λ\n".encode(encoding, "replace")
     monkeypatch.setattr(sys, "stdout", io.StringIO())  # a notebook's
-    show_what_can_be_shown()
+    replace_unprintable()

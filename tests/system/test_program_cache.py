@@ -75,7 +75,7 @@ def test_where_no_limit_can_be_read_nothing_is_let_go(monkeypatch, tmp_path):
 
 def test_looks_are_seldom(monkeypatch):
     monkeypatch.setattr(programs, "_mappings", lambda: pytest.fail("looked"))
-    monkeypatch.setattr(programs, "_looked", programs.time.monotonic())
+    monkeypatch.setattr(programs, "_counted_at", programs.time.monotonic())
     assert not programs.make_room()
 
 

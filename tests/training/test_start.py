@@ -148,7 +148,7 @@ def test_each_seed_goes_on_from_its_own_and_with_others_the_same(env, kept):
         (dict(hidden_size=16), "has hidden_size=8, and the new training 16"),
         (dict(normalise_observations=False), "has normalise_observations=True"),
         (dict(freeze="actor.heart"), "actor has no layer 'heart'.*head.*its layers are"),
-        (dict(freeze="body"), "'body' is not actor or critics"),
+        (dict(freeze="body"), "'body' is not actor, critics"),
         (dict(start=3), "start must be a string"),
     ],
 )

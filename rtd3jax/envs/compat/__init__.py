@@ -1,1 +1,1 @@
-"""Environments of gymnax, Gymnasium and Brax, and ours for Gymnasium."""
+"""Adapters for environments of gymnax, Gymnasium and Brax, and to Gymnasium."""

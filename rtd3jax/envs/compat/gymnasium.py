@@ -153,7 +153,7 @@ def to_gymnasium(env: Any, *, params: Any = None, render_mode: str | None = None
     Raises:
         UserError: if ``env`` is not a gymnax >= 1.0 environment, or in a forked process.
     """
-    made = _made(id(env), render_mode, lambda: GymnasiumEnv(env, params, render_mode))
+    made = _construct(id(env), render_mode, lambda: GymnasiumEnv(env, params, render_mode))
     try:
         weakref.finalize(env, _seen.pop, id(env), None)
     except TypeError:  # an object without weak references: its spaces are not kept
@@ -170,14 +170,16 @@ def make_gymnasium(
     def construct() -> GymnasiumEnv:
         return GymnasiumEnv(make(env_id, disturbance, **parameters), render_mode=render_mode)
 
-    return _made(key, render_mode, construct)
+    return _construct(key, render_mode, construct)
 
 
 # gymnasium.make reads the render modes here, to offer others such as "rgb_array_list".
 make_gymnasium.metadata = GymnasiumEnv.metadata  # type: ignore[attr-defined]
 
 
-def _made(key: Any, render_mode: str | None, construct: Callable[[], GymnasiumEnv]) -> GymnasiumEnv:
+def _construct(
+    key: Any, render_mode: str | None, construct: Callable[[], GymnasiumEnv]
+) -> GymnasiumEnv:
     """The environment that ``construct`` makes; in a forked process, its replacement."""
     if os.getpid() != _PROCESS:
         return _Forked(key, render_mode)

@@ -113,13 +113,13 @@ class FilterPolicy:
         left = jnp.int32(self.pendulum.max_steps_in_episode) - 1 - time
         value = self.values[jnp.clip(left, 0, self.values.shape[0] - 1)]
 
-        def worth(torque):
+        def mean_value(torque):
             after, speed_after, reward = swing(self.pendulum, angle, speed, torque)
             later = interpolate(value, after, speed_after, self.pendulum.max_speed)
             return weight @ (reward + later)
 
         torques = torques_to_try(self.pendulum.max_torque)
-        return torques[jnp.argmax(jax.vmap(worth)(torques))]
+        return torques[jnp.argmax(jax.vmap(mean_value)(torques))]
 
 
 def filter_policy(env: EnvironmentLike) -> FilterPolicy:

@@ -34,7 +34,7 @@ def feedforward_pi(env: EnvironmentLike) -> PIDPolicy | None:
     return pid_policy(env, kp=0.1, ki=1.0, feedforward=constant_command(env), ignored=1)
 
 
-def met_slip(state: RoverState) -> jax.Array | None:
+def next_slip(state: RoverState) -> jax.Array | None:
     """The slip [..., 2] that acts in the next step; None without a slip process."""
     parts = state.slip if type(state.slip) is tuple else (state.slip,)
     return next((part.slip for part in parts if hasattr(part, "slip")), None)
@@ -59,7 +59,7 @@ register(
         kind="rover",
         # The step has no length in seconds; the page states the length that it assumes.
         constants=("wheelbase", "target_speed", "target_yaw_rate"),
-        hidden=met_slip,
+        hidden=next_slip,
         hidden_name="slip",
         hidden_elements=("left", "right"),
     ),
