@@ -10,7 +10,7 @@ import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 
 from rtd3jax.cli.common import replace_unprintable
-from rtd3jax.envs.builtin import DISTURBANCES
+from rtd3jax.envs.builtin import LISTED
 from rtd3jax.envs.registry import FAULTS
 from rtd3jax.registries import AGENTS, MEMORIES
 from rtd3jax.study.presets import PRESETS
@@ -44,7 +44,7 @@ def _lines() -> Iterator[str]:
         yield f"  {name:10}{purpose}"
     yield f"\nPresets of the sweep: {', '.join(PRESETS)}"
     yield "\nEnvironments, and the disturbances of each:"
-    for env, disturbances in DISTURBANCES.items():
+    for env, disturbances in LISTED.items():
         yield from _listed(env, (name for name in disturbances if name not in FAULTS))
     yield from _listed("any", FAULTS)
     yield "  rtd3jax.make also makes gymnax's environments; rtd3jax.register adds others."

@@ -12,7 +12,7 @@ import jax
 from rtd3jax.agents.variants import ALGORITHMS
 from rtd3jax.cli.common import add_import, replace_unprintable
 from rtd3jax.config import Config
-from rtd3jax.envs.builtin import DISTURBANCES, ENVIRONMENTS
+from rtd3jax.envs.builtin import LISTED
 from rtd3jax.errors import UserError
 from rtd3jax.registries import AGENTS
 from rtd3jax.study.loggers import LOGGERS
@@ -31,7 +31,7 @@ class _Parser(argparse.ArgumentParser):
 def parser(description: str | None) -> argparse.ArgumentParser:
     """The command line of ``rtd3jax.sweep``; bad input raises `UserError`."""
     replace_unprintable()
-    environments = "\n".join(f"  {env}: {', '.join(DISTURBANCES[env])}" for env in ENVIRONMENTS)
+    environments = "\n".join(f"  {env}: {', '.join(names)}" for env, names in LISTED.items())
     found = _Parser(
         prog="python -m rtd3jax.sweep",
         description=description,
@@ -47,7 +47,7 @@ def parser(description: str | None) -> argparse.ArgumentParser:
         "--preset", choices=sorted(PRESETS), help="a study with its settings, ready to run"
     )
     study.add_argument(
-        "--env", help=f"{', '.join(ENVIRONMENTS)}, a registered id, or any id that gymnax makes"
+        "--env", help=f"{', '.join(LISTED)}, a registered id, or any id that gymnax makes"
     )
     add_import(study)
     study.add_argument(
