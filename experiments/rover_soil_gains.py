@@ -21,9 +21,9 @@ sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
 
 GROUND, SEED, EPISODES = "mixed-slope", 1000, 1_000
-PROPORTIONAL = (0.0, 0.05, 0.1, 0.2, 0.4)
-INTEGRAL = (0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
-SHARES = (0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0)
+PROPORTIONAL = (0.0, 0.1, 0.2, 0.3, 0.4)
+INTEGRAL = (0.6, 0.8, 1.0, 1.2, 1.4, 1.6)
+SHARES = (0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 1.0)
 
 
 def main(arguments: list[str] | None = None) -> int:

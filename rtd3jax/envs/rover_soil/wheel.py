@@ -37,6 +37,9 @@ SMALLEST_ENTRY, LARGEST_ENTRY = 0.02, 1.5
 """rad: a wheel that sinks deeper than nearly its radius is beyond the model."""
 
 
+_Sums = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
+
+
 class Wheel(struct.PyTreeNode):
     """A rigid cylinder without grousers."""
 
@@ -89,7 +92,7 @@ def contact_forces(
     scale = jnp.log(soil.pressure) + soil.exponent * jnp.log(radius / REFERENCE_SINKAGE)
     stiffness = radius / soil.shear_modulus
 
-    def add(sums: tuple[jax.Array, ...], node: jax.Array) -> tuple[tuple[jax.Array, ...], None]:
+    def add(sums: _Sums, node: jax.Array) -> tuple[_Sums, None]:
         vertical, pull, torque, torque_slope = sums
         share, weight = node[0], node[1]
         ahead = peak + share * before
@@ -111,7 +114,8 @@ def contact_forces(
 
     # A loop over the nodes: written out, they take four times as long to compile and to run.
     nodes = jnp.asarray(np.stack(unit_nodes(NODES), axis=1), dtype)
-    sums, _ = jax.lax.scan(add, (jnp.zeros_like(entry),) * 4, nodes)
+    zero = jnp.zeros_like(entry)
+    sums, _ = jax.lax.scan(add, (zero, zero, zero, zero), nodes)
     vertical, pull, torque, torque_slope = sums
     area = radius * width
     return Forces(

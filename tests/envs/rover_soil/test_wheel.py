@@ -200,10 +200,11 @@ terramechanics/trench_off_smooth_new.mat), whose parameters of sand and wheel ar
 
 @pytest.mark.parametrize(("slip", "load", "pull"), MEASURED)
 def test_measured_pulls_are_met_within_the_scatter_of_the_model(slip, load, pull):
-    """Within 3% of the load: the pull itself is small here, and no model of this kind hits it."""
+    """Within 3% of the load. The pull itself is small here, and missed by more than a tenth."""
     soil = soils.Soil(1000.0, 29.0, 0.021, 0.0, 8e6, 1.46 + 0.01 * slip, 0.2024, 0.7048, 0.236)
     _, found = solved(soil, [slip], wheel=Wheel(radius=0.058, width=0.05), load=load)
     assert found.pull[0] == pytest.approx(pull, abs=0.03 * load)
+    assert abs(found.pull[0] / pull - 1.0) > 0.1
 
 
 @pytest.mark.parametrize(
