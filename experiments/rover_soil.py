@@ -65,15 +65,17 @@ def row_of(policy: object, world: tuple[str, str], who: tuple, episodes: int) ->
     return dict(zip(COLUMNS, values, strict=True))
 
 
-def agents(runs: dict[str, pathlib.Path], episodes: int) -> tuple[list[dict], list[str]]:
+def agents(
+    runs: dict[str, pathlib.Path], grounds: tuple[str, ...], seeds: int, episodes: int
+) -> tuple[list[dict], list[str]]:
     """A row per trained policy and world, and what is missing."""
-    plan = [("rover", slip, ground) for ground in GROUNDS for slip in SLIPS]
-    plan += [("rover-soil", ground, world) for ground in GROUNDS for world in (ground, *SLIPS)]
+    plan = [("rover", slip, ground) for ground in grounds for slip in SLIPS]
+    plan += [("rover-soil", ground, world) for ground in grounds for world in (ground, *SLIPS)]
     rows, missing = [], []
     for trained_in, trained_on, tested_on in plan:
         world = ("rover-soil" if tested_on in GROUNDS else "rover", tested_on)
         for algorithm in rtd.ALGORITHMS:
-            for seed in range(SEEDS):
+            for seed in range(seeds):
                 try:
                     policy = rtd.load_policy(
                         runs[trained_in], algorithm=algorithm, disturbance=trained_on, seed=seed
@@ -85,10 +87,10 @@ def agents(runs: dict[str, pathlib.Path], episodes: int) -> tuple[list[dict], li
     return rows, sorted(set(missing))
 
 
-def controllers(episodes: int) -> list[dict]:
+def controllers(grounds: tuple[str, ...], seeds: int, episodes: int) -> list[dict]:
     """A row per controller, ground and seed."""
     rows = []
-    for ground in GROUNDS:
+    for ground in grounds:
         env = rtd.make("rover-soil", ground)
         policies = {
             "adaptive slip estimate": adaptive_slip(env),
@@ -97,7 +99,7 @@ def controllers(episodes: int) -> list[dict]:
             "Bayes policy told AR(1) slip": rtd.bayes_policy(rtd.make("rover", "ar1-slip")),
         }
         for name, policy in policies.items():
-            for seed in range(SEEDS):
+            for seed in range(seeds):
                 world = ("rover-soil", ground)
                 rows.append(row_of(policy, world, (name, "no training", seed), episodes))
     return rows
@@ -126,11 +128,11 @@ def text_of(values: np.ndarray) -> str:
     return f"{values.mean():.2f} [{low:.2f}, {high:.2f}]{count}"
 
 
-def table(rows: pd.DataFrame) -> str:
+def table(rows: pd.DataFrame, grounds: tuple[str, ...]) -> str:
     """A table for each ground, one of the way back, and the differences that the study is about."""
     parts = []
     untrained = list(dict.fromkeys(rows[rows["trained_on"] == "no training"]["algorithm"]))
-    for ground in GROUNDS:
+    for ground in grounds:
         body = [
             [name, *(text_of(pick(rows, name, source, ground)) for source in (*SLIPS, ground))]
             for name in rtd.ALGORITHMS
@@ -141,19 +143,19 @@ def table(rows: pd.DataFrame) -> str:
         ]
         header = ["agent", *(f"trained on {slip}" for slip in SLIPS), "trained here, or not at all"]
         parts.append(f"Tested on `{ground}`:\n\n{markdown_table(header, body)}")
-    header = ["agent", *(f"{ground} → {slip}" for ground in GROUNDS for slip in SLIPS)]
+    header = ["agent", *(f"{ground} → {slip}" for ground in grounds for slip in SLIPS)]
     body = [
-        [name, *(text_of(pick(rows, name, g, slip)) for g in GROUNDS for slip in SLIPS)]
+        [name, *(text_of(pick(rows, name, g, slip)) for g in grounds for slip in SLIPS)]
         for name in rtd.ALGORITHMS
     ]
     parts.append(f"The way back, to the rover's slips:\n\n{markdown_table(header, body)}")
-    return "\n\n".join([*parts, differences(rows, untrained)])
+    return "\n\n".join([*parts, differences(rows, grounds, untrained)])
 
 
-def differences(rows: pd.DataFrame, untrained: list[str]) -> str:
+def differences(rows: pd.DataFrame, grounds: tuple[str, ...], untrained: list[str]) -> str:
     """What training on the ground gains over each slip, and over the best controller there."""
     body = []
-    for ground in GROUNDS:
+    for ground in grounds:
         controllers_here = {name: pick(rows, name, "no training", ground) for name in untrained}
         best = max(controllers_here, key=lambda name: controllers_here[name].mean())
         for name in rtd.ALGORITHMS:
@@ -183,24 +185,27 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     began, steps, episodes = time.time(), options.steps, EPISODES
     tiny: dict[str, object] = {}
+    grounds, seeds = GROUNDS, SEEDS
     if options.quick:
         steps, episodes, tiny = QUICK_STEPS, QUICK_EPISODES, TINY
+        grounds, seeds = GROUNDS[:1], 1
     if not options.report:
         lost = train_on_slip(options.slip_run, steps, tiny)
         for line in [*lost, *train_on_soil(options.run, steps, tiny)]:
             print(line, file=sys.stderr)
-    found, missing = agents({"rover": options.slip_run, "rover-soil": options.run}, episodes)
-    rows = pd.DataFrame([*found, *controllers(episodes)], columns=COLUMNS)
+    runs = {"rover": options.slip_run, "rover-soil": options.run}
+    found, missing = agents(runs, grounds, seeds, episodes)
+    rows = pd.DataFrame([*found, *controllers(grounds, seeds, episodes)], columns=COLUMNS)
     facts = provenance(
         steps=steps,
         history_length=HISTORY_LENGTH,
         **SETTINGS,
-        seeds=SEEDS,
+        seeds=seeds,
         episodes_per_seed=episodes,
         missing=len(missing),
         minutes_of_the_last_call=round((time.time() - began) / 60, 1),
     )
-    text = table(rows)
+    text = table(rows, grounds)
     write_results(options.out, "rover_soil", rows, text, facts)
     print(text)
     for line in missing:

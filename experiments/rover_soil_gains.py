@@ -21,8 +21,8 @@ sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
 
 GROUND, SEED, EPISODES = "mixed-slope", 1000, 1_000
-PROPORTIONAL = (0.0, 0.1, 0.2, 0.3, 0.4)
-INTEGRAL = (0.6, 0.8, 1.0, 1.2, 1.4, 1.6)
+PROPORTIONAL = (0.0, 0.1, 0.2, 0.3)
+INTEGRAL = (0.6, 0.8, 1.0, 1.2, 1.4, 1.6, 1.8)
 SHARES = (0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 1.0)
 
 
@@ -61,7 +61,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(rows[-1], flush=True)
     table = pd.DataFrame(rows).sort_values(["controller", "mean"], ascending=[True, False])
     body = [
-        [r.controller, r.gains, f"{r.mean:.3f} ± {r.standard_error:.3f}"]
+        [r.controller, r.gains, f"{r.mean:.4f} ± {r.standard_error:.4f}"]
         for r in table.itertuples()
     ]
     text = markdown_table(["controller", "gains", "return ± standard error"], body)

@@ -47,6 +47,25 @@ def test_the_rover_experiment_runs_and_says_what_is_missing(tmp_path, capsys):
     assert (out / "rover_drive.gif").read_bytes().startswith(b"GIF")
 
 
+@pytest.mark.slow
+def test_the_rover_on_soil_meets_agents_of_the_rover(tmp_path, capsys):
+    soil = load(EXPERIMENTS / "rover_soil.py")
+    runs = ["--slip-run", str(tmp_path / "slip"), "--run", str(tmp_path / "soil")]
+    assert soil.main(["--quick", *runs, "--out", str(tmp_path)]) == 0
+    rows = pd.read_parquet(tmp_path / "rover_soil.parquet")
+    ways = set(zip(rows["trained_on"], rows["tested_on"], strict=True))
+    ground = "dry-sand"
+    assert {("ar1-slip", ground), (ground, ground), (ground, "sine-slip")} <= ways
+    assert ("no training", ground) in ways and np.isfinite(rows["mean"]).all()
+    said = capsys.readouterr().out
+    assert "not trained yet" in said and "missing: " in said and "undecided" in said
+
+
+def test_the_cost_of_a_step_on_soil_is_said(capsys):
+    load(EXPERIMENTS / "rover_soil_cost.py").main(["--quick"])
+    assert "rover-soil mixed-slope: step_env" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     "name",
     [
@@ -58,6 +77,7 @@ def test_the_rover_experiment_runs_and_says_what_is_missing(tmp_path, capsys):
         pytest.param("segments_returns", marks=pytest.mark.slow),
         pytest.param("many_environments", marks=pytest.mark.slow),
         pytest.param("fine_tuning", marks=pytest.mark.slow),
+        pytest.param("rover_soil_gains", marks=pytest.mark.slow),
     ],
 )
 def test_small_experiments_run(name, tmp_path):

@@ -32,9 +32,9 @@ def feedforward_pi(env: EnvironmentLike) -> PIDPolicy | None:
     )
 
 
-PI_GAINS = (0.1, 1.0)
+PI_GAINS = (0.0, 1.6)
 """(kp, ki)"""
-ESTIMATE_GAIN = 0.5
+ESTIMATE_GAIN = 1.0
 """Share of each new reading of the slip in the estimate; from the same search as ``PI_GAINS``."""
 LARGEST_SLIP = 0.8
 """Of the estimate: beyond it no command within the bounds helps."""

@@ -23,7 +23,7 @@ from jax.typing import ArrayLike
 from rtd3jax.envs.identity import ValueIdentity, strong
 from rtd3jax.envs.processes.process import NoDisturbance, Process, float32
 from rtd3jax.envs.rover_soil.field import Ground, GroundState
-from rtd3jax.envs.rover_soil.soil import LocalSoil, local_soil
+from rtd3jax.envs.rover_soil.soil import LocalSoil, Soil, local_soil
 from rtd3jax.envs.rover_soil.wheel import (
     LARGEST_ENTRY,
     Forces,
@@ -232,13 +232,18 @@ def check_ground(params: RoverSoilParams) -> None:
     wheel = wheel_of(params)
     wheel.validate()
     for soil in (ground.soil, ground.other):
-        met = local_soil(soil, wheel.width)
-        entry = entry_angle(met, wheel, float32(load), jnp.float32(1.0))
-        if float(entry) >= LARGEST_ENTRY:
+        if float(_deepest(soil, wheel, load)) >= LARGEST_ENTRY:
             raise UserError(
                 f"rover-soil: under {load:g} N a wheel of {wheel.radius:g} m sinks deeper than its "
                 "radius at full slip; give a stiffer soil, a larger wheel or a smaller mass"
             )
+
+
+@jax.jit
+def _deepest(soil: Soil, wheel: Wheel, load: ArrayLike) -> jax.Array:
+    """Entry angle at full slip."""
+    met = local_soil(soil, wheel.width)
+    return entry_angle(met, wheel, float32(load), jnp.float32(1.0))
 
 
 def wheel_of(params: RoverSoilParams) -> Wheel:
