@@ -29,7 +29,7 @@ from rtd3jax.study.presets import ROVER_SETTINGS as SETTINGS
 from rtd3jax.study.presets import ROVER_STEPS as STEPS
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-from claims import RESAMPLES, Effect  # noqa: E402
+from claims import RESAMPLES, ROVER_MARGIN, Effect  # noqa: E402
 from rover import EPISODES, PAPER_EPISODES, SEEDS  # noqa: E402
 from rover import train as train_on_slip  # noqa: E402
 from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
@@ -161,11 +161,18 @@ def differences(rows: pd.DataFrame, grounds: tuple[str, ...], untrained: list[st
         for name in rtd.ALGORITHMS:
             there = pick(rows, name, ground, ground)
             effects = [
-                Effect(f"{name}: trained here over {slip}", there, pick(rows, name, slip, ground))
+                Effect(
+                    f"{name}: trained here over {slip}",
+                    there,
+                    pick(rows, name, slip, ground),
+                    ROVER_MARGIN,
+                )
                 for slip in SLIPS
             ]
             effects += [
-                Effect(f"{name}, {slip} over {best}", transferred, controllers_here[best])
+                Effect(
+                    f"{name}, {slip} over {best}", transferred, controllers_here[best], ROVER_MARGIN
+                )
                 for slip in SLIPS
                 if len(transferred := pick(rows, name, slip, ground))
             ]

@@ -2,7 +2,7 @@
 
 import jax
 
-from rtd3jax.envs.about import Drawing
+from rtd3jax.envs.description import Drawing
 from rtd3jax.envs.registry import register
 from rtd3jax.envs.rover_soil.controllers import adaptive_slip, constant_command, feedforward_pi
 from rtd3jax.envs.rover_soil.environment import RoverSoil, RoverSoilState

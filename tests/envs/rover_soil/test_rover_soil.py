@@ -7,7 +7,7 @@ import pytest
 from soil_oracle import forces, loaded
 
 import rtd3jax as rtd
-from rtd3jax.envs.registry import about_of, make
+from rtd3jax.envs.registry import description_of, make
 from rtd3jax.envs.rover_soil import DRY_SAND, REGOLITH, Ground, RoverSoil, RoverSoilParams
 from rtd3jax.envs.rover_soil.controllers import adaptive_slip
 from rtd3jax.envs.rover_soil.environment import Motion, drive, sides, wheel_load
@@ -261,7 +261,7 @@ def test_what_makes_no_sense_is_refused_in_one_line(call, said):
 def test_baselines_beat_the_constant_command():
     env = make("rover-soil", "dry-sand")
     means = {}
-    for name, make_one in about_of(env, "rover-soil").baselines.items():
+    for name, make_one in description_of(env, "rover-soil").baselines.items():
         made = make_one(env)
         policy = rtd.constant_policy(made) if isinstance(made, tuple) else made
         means[name] = float(np.mean(rtd.evaluate(policy, env, 64, 3)))
@@ -286,6 +286,6 @@ def test_the_adaptive_controller_finds_a_constant_slip():
 
 def test_controllers_have_nothing_to_say_where_an_error_is_hidden():
     env = rtd.disturb(make("rover-soil", "dry-sand"), rtd.Hidden(element=1))
-    baselines = about_of(env, "rover-soil").baselines
+    baselines = description_of(env, "rover-soil").baselines
     assert baselines["adaptive-slip"](env) is None and baselines["feedforward-pi"](env) is None
     assert baselines["constant"](env) == (0.5, 0.0)
