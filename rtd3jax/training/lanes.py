@@ -205,28 +205,38 @@ class _Pool:
             id(group): (group.wave, cells.index(id(group.jobs[0].cell))) for group in groups
         }
         self._events: list[Group] = []
+        self._unhandled: list[Group] = []
+        """Groups that have ended and are not recorded yet: their states are still in memory."""
         self._stopped = False
         self._changed = threading.Condition()
 
     def take(self) -> Group | None:
         """The idle group with the fewest steps; None if this worker will get no more groups."""
         with self._changed:
-            while not self._idle and self._busy and not self._stopped:
+            while (group := self._next()) is None:
+                if self._stopped or not (self._idle or self._busy):
+                    return None
                 self._changed.wait()
-            if not self._idle or self._stopped:
-                return None
-            # One cell after the other, so that results come early and few replays are in memory;
-            # within a cell, the group with the fewest steps.
-            group = min(self._idle, key=lambda g: (self._rank[id(g)], g.step))
             self._idle.remove(group)
             self._busy += 1
             return group
 
+    def _next(self) -> Group | None:
+        """The group to advance next; None if there is none yet."""
+        if not self._idle or self._stopped:
+            return None
+        # One cell after the other, so that results come early and few replays are in memory;
+        # within a cell, the group with the fewest steps.
+        group = min(self._idle, key=lambda g: (self._rank[id(g)], g.step))
+        # Recording takes a while, and the memory is enough for one wave.
+        if group.state is None and any(ended.wave < group.wave for ended in self._unhandled):
+            return None
+        return group
+
     def give_back(self, group: Group) -> None:
         with self._changed:
             self._busy -= 1
-            if not group.finished:
-                self._idle.append(group)
+            (self._unhandled if group.finished else self._idle).append(group)
             self._events.append(group)
             self._changed.notify_all()
 
@@ -241,6 +251,10 @@ class _Pool:
                     self._changed.wait(timeout=0.2)
                 group = self._events.pop(0)
             yield group
+            with self._changed:
+                if group in self._unhandled and group not in self._events:
+                    self._unhandled.remove(group)
+                    self._changed.notify_all()
 
     def stop(self) -> None:
         with self._changed:

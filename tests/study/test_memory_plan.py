@@ -1,12 +1,14 @@
 """Compares the memory plan with XLA's reservations, and tests the split of lanes."""
 
+import time
+
 import jax
 import jax.numpy as jnp
 import pytest
 
 import rtd3jax as rtd
 from rtd3jax.study import memory_plan
-from rtd3jax.training.lanes import make_groups
+from rtd3jax.training.lanes import advance_groups, make_groups
 from rtd3jax.training.run import make_jobs
 
 
@@ -59,10 +61,27 @@ def test_a_small_limit_leaves_room_for_the_process(monkeypatch):
     assert memory_plan.usable_memory() == 0
 
 
+def test_a_wave_begins_when_the_one_before_is_recorded():
+    """Recording takes a while: workers that went on had all lanes in memory at the same time."""
+    jobs = _jobs(
+        seeds=6, hidden_size=4, batch_size=4, learning_starts=8, total_steps=24, eval_every=24
+    )
+    groups = make_groups(jobs, "map", 2, 2)
+    in_memory = []
+
+    def record(group):
+        if group.finished and group.state is not None:
+            time.sleep(0.3)
+            in_memory.append(sum(other.state is not None for other in groups))
+            group.state = None
+
+    advance_groups(groups, record, devices=[jax.devices()[0]] * 2)
+    assert all(group.finished and group.error is None for group in groups)
+    assert len(in_memory) == 6 and max(in_memory) <= 2
+
+
 @pytest.mark.slow
 def test_chunks_give_the_same_results():
-    from rtd3jax.training.lanes import advance_groups
-
     jobs = _jobs(
         seeds=2, hidden_size=4, batch_size=4, learning_starts=8, total_steps=24, eval_every=12
     )
