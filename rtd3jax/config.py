@@ -8,6 +8,7 @@ of the published TD3 (Fujimoto et al., 2018) and LSTM-TD3 (Meng et al., 2021).
 import dataclasses
 import math
 import warnings
+from collections.abc import Mapping
 from typing import Any
 
 from rtd3jax.errors import UserError, nearest
@@ -218,8 +219,6 @@ class Config:
         if self.replay == "segments":
             self._check_segments()
         self._check_environments(capacity)
-        if self.actor_starts is None:
-            object.__setattr__(self, "actor_starts", self.learning_starts)
         for name in ("start", "freeze"):
             if not isinstance(getattr(self, name), str):
                 raise UserError(f"{name} must be a string, not {getattr(self, name)!r}")
@@ -396,10 +395,14 @@ class Config:
         return -(-steps // self.steps_per_round) * self.updates_per_round
 
     @property
+    def first_actor_step(self) -> int:
+        """The environment step from which on the actor is updated."""
+        return self.learning_starts if self.actor_starts is None else self.actor_starts
+
+    @property
     def updates_before_the_actor(self) -> int:
         """Critic updates before the actor is first updated."""
-        assert self.actor_starts is not None  # resolved when it was made
-        return max(0, -(-(self.actor_starts - self.learning_starts) // self.update_every))
+        return max(0, -(-(self.first_actor_step - self.learning_starts) // self.update_every))
 
     @property
     def capacity(self) -> int:
@@ -408,8 +411,23 @@ class Config:
         return self.replay_capacity
 
     def to_dict(self) -> dict[str, Any]:
-        """The fields as JSON-ready values."""
-        return dataclasses.asdict(self)
+        """The fields as JSON-ready values, with the step at which the actor does start."""
+        return {**dataclasses.asdict(self), "actor_starts": self.first_actor_step}
+
+    @classmethod
+    def from_dict(cls, fields: Mapping[str, Any]) -> "Config":
+        """The configuration that `to_dict` wrote, in this version or an earlier one.
+
+        An actor that starts when learning does is taken for one that was not told when.
+
+        Raises:
+            UserError: when a value is impossible.
+            TypeError: when there is no such field.
+        """
+        given = dict(fields)
+        if given.get("actor_starts") == given.get("learning_starts", cls.learning_starts):
+            del given["actor_starts"]
+        return cls(**given)
 
 
 def traced_fields() -> tuple[str, ...]:

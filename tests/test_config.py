@@ -44,6 +44,25 @@ def test_a_resolved_configuration_is_a_fixed_point():
     assert dataclasses.replace(config) == config and config.replay_capacity == config.total_steps
 
 
+def test_the_actor_starts_with_learning_unless_it_is_told_when():
+    config = rtd.Config()
+    later = dataclasses.replace(config, learning_starts=5_000)
+    assert (config.first_actor_step, later.first_actor_step) == (1_000, 5_000)
+    assert later.updates_before_the_actor == 0
+    told = dataclasses.replace(rtd.Config(actor_starts=1_000), learning_starts=500)
+    assert told.first_actor_step == 1_000 and told.updates_before_the_actor == 500
+
+
+@pytest.mark.parametrize("given", [{}, {"actor_starts": 3_000}, {"learning_starts": 2_000}])
+def test_a_configuration_is_read_as_it_was_written(given):
+    config = rtd.Config(**given)
+    fields = config.to_dict()
+    assert fields["actor_starts"] == config.first_actor_step  # a number, as it always was
+    assert rtd.Config.from_dict(fields) == config
+    del fields["actor_starts"]  # of before there was the field
+    assert rtd.Config.from_dict(fields).actor_starts is None
+
+
 @given(
     st.dictionaries(
         st.sampled_from([f.name for f in dataclasses.fields(rtd.Config)]),
