@@ -165,6 +165,22 @@ def test_what_does_not_fit_is_refused_before_compilation(
         rtd.train(env, _config(**changes), [0], progress=False, start=start)
 
 
+def test_a_checkpoint_is_read_once_and_let_go(env, kept, monkeypatch):
+    from rtd3jax.training import start as module
+
+    _, directory = kept
+    read = []
+    monkeypatch.setattr(module, "read_arrays", lambda f: read.append(f) or read_arrays(f))
+    start = starts_of_path(directory, (1,))[1]
+    (job,) = make_jobs(env, _config(start="there"), [1], starts={1: start})
+    start.check(job.program, job.lane)
+    (held, _), (arrays, _) = start._read, read_arrays(start.checkpoint)
+    assert ".learner.critic_optimizer.count" in held and set(held) < set(arrays)
+    assert not any("replay" in name for name in held)  # it may be large
+    start.begin(job.program, job.lane, jax.eval_shape(job.program.init, job.lane))
+    assert read == [start.checkpoint] and "_read" not in vars(start)
+
+
 def test_a_lost_lane_is_no_start(env, kept, tmp_path):
     _, directory = kept
     shutil.copytree(directory, tmp_path / "lost")
