@@ -253,3 +253,29 @@ def test_a_sweep_goes_on_from_another_and_says_so(tmp_path, monkeypatch, capsys)
     # What is done needs its beginning no more.
     shutil.rmtree(tmp_path / "first")
     assert sweep.main([*begun, "--out", second, "--freeze", "actor.current"]) == 0
+
+
+def test_what_fresh_moves_away_is_no_start(tmp_path, capsys):
+    def command(disturbance, out, start):
+        study = ["--disturbances", disturbance, "--seeds", "1", "--out", str(tmp_path / out)]
+        return [*FLAGS, *study, "--fresh", "--start", str(start)]
+
+    config = rtd.Config(**{**SMALL, "start": "elsewhere"})
+    own, other = (
+        RunDirectory(tmp_path / name, [rtd.Cell("rover", "ar1-slip", config)], [0], 2)
+        for name in ("own", "other")
+    )
+    (tmp_path / "link").symlink_to(own.path)
+    for start in (own.path, f"{own.path}@ar1-slip", own.path / "policy", tmp_path / "link"):
+        assert sweep.main(command("ar1-slip", "own", start)) == 2
+        error = capsys.readouterr().err
+        assert f"--start {start} lies in {own.path}, which --fresh moves" in error
+        assert error.count("\n") == 1
+    # What is done there now is to be trained again: its start is looked at before anything moves.
+    (cell,) = own.cells
+    own.lanes.write_error(cell, 0, "makes the folder")
+    own.lanes.lane_path(cell, 0).touch()
+    assert own.lanes.is_done(cell, 0)
+    assert sweep.main(command("ar1-slip", "own", f"{other.path}@none")) == 2
+    assert "has no td3 under none to begin from" in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "other", "own"]
