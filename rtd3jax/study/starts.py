@@ -15,7 +15,9 @@ from rtd3jax.training.start import Start, starts_of_path
 def add_starts(
     directory: RunDirectory, jobs: Sequence[Job], *, write: bool, fresh: bool = False
 ) -> None:
-    """Give each job that is still to begin what it goes on from, and see that it can.
+    """Give each job that is not done what it began from, and see that those can that are new.
+
+    One that is under way has checkpoints, and may start over where they are of no use.
 
     Args:
         directory: of the study.
@@ -32,6 +34,8 @@ def add_starts(
             continue
         if fresh or not checkpoint_files(directory.lanes.checkpoint_directory(*job.key)):
             by_cell.setdefault(job.cell, []).append(job)
+        elif job.start is None:
+            job.start = _start_or_why_not(job.cell, job.seed)
     for cell, own in by_cell.items():
         new = [job for job in own if job.start is None]
         starts = starts_of(cell, [job.seed for job in new])
@@ -41,6 +45,13 @@ def add_starts(
         for job in own:
             if write and job.start is not None:
                 directory.lanes.write_start(cell, job.seed, job.start.about)
+
+
+def _start_or_why_not(cell: Cell, seed: int) -> Start:
+    try:
+        return starts_of(cell, [seed])[seed]
+    except UserError as error:
+        return Start(cell.config.start, missing=str(error))
 
 
 def check_starts_stay(cells: Iterable[Cell], out: Path) -> None:

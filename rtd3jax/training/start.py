@@ -40,11 +40,14 @@ class Start:
         where: what it is, for people.
         policy: the trained policy, where that is all there is.
         checkpoint: the file of a lane that has more; None otherwise.
+        missing: why there is neither any more. A lane that is under way does not need its start,
+            unless its own checkpoints are lost.
     """
 
     where: str
     policy: Policy | None = None
     checkpoint: Path | None = None
+    missing: str | None = None
 
     @property
     def about(self) -> str:
@@ -67,6 +70,10 @@ class Start:
         self._begin(program, lane, jax.eval_shape(program.init, lane))
 
     def _begin(self, program: Program, lane: Lane, state: LaneState) -> LaneState:
+        if self.missing is not None:
+            raise UserError(
+                f"a lane that began from {self.where} cannot start over: {self.missing}"
+            )
         if self.checkpoint is not None:
             return self._whole(program, lane, state)
         policy = self.policy

@@ -14,9 +14,11 @@ from rtd3jax import sweep
 from rtd3jax.agents.freeze import frozen_parts
 from rtd3jax.study import finish, references
 from rtd3jax.study.derive import derive
+from rtd3jax.study.execute import checkpoints_of
 from rtd3jax.study.rundir import RunDirectory
-from rtd3jax.study.starts import starts_of
+from rtd3jax.study.starts import add_starts, starts_of
 from rtd3jax.system.files import read_arrays, write_arrays
+from rtd3jax.training import lanes
 from rtd3jax.training.run import make_jobs
 from rtd3jax.training.start import KNOWN_OBSERVATIONS, starts_of_path
 
@@ -156,8 +158,6 @@ def test_each_seed_goes_on_from_its_own_and_with_others_the_same(env, kept):
 def test_what_does_not_fit_is_refused_before_compilation(
     env, kept, monkeypatch, of, changes, message
 ):
-    from rtd3jax.training import lanes
-
     run, directory = kept
     monkeypatch.setattr(lanes, "_chunk", lambda *_: pytest.fail("compiled"))
     start = run.policy(0) if of == "policy" else directory
@@ -212,6 +212,42 @@ def test_what_is_no_start_is_refused(env, kept, tmp_path):
     config = _config(normalise_observations=False)
     with pytest.raises(rtd.UserError, match="2 observation and 2 action elements.*has 3 and 1"):
         rtd.train(pendulum, config, [0], progress=False, start=policy)
+
+
+def test_side_by_side_lanes_whose_checkpoints_are_of_no_use_begin_from_the_start_again(
+    env, kept, tmp_path
+):
+    run, _ = kept
+    file = tmp_path / "p.safetensors"
+    run.policy(0).save(file)
+    cell = rtd.Cell("rover", "sine-slip", _config(start=str(file)))
+    directory = RunDirectory(tmp_path / "run", [cell], [0, 1], 2)
+    checkpoints = checkpoints_of(directory, (None, None))
+    jobs = directory.jobs("vmap")
+    program = jobs[0].program
+    states = jax.jit(jax.vmap(program.init))(lanes.stacked([job.lane for job in jobs], None))
+    for job, group_step in zip(jobs, (20, 40), strict=True):
+        (state,) = (s for j, s in lanes.Group(jobs, state=states).lanes() if j is job)
+        checkpoints.save([(job, state)], job, group_step)
+        # The newest of both is of step 60, and the first lane's is cut short.
+        checkpoints.save([(job, state)], job, 60)
+    newest = directory.lanes.checkpoint_directory(cell, 0) / "step-000000060.safetensors"
+    newest.write_bytes(newest.read_bytes()[:1000])
+    add_starts(directory, jobs, write=True)
+    assert not directory.lanes.start_path(cell, 0).exists()  # it stands there since they began
+    (group,) = lanes.make_groups(jobs, "vmap", 1, checkpoints=checkpoints)
+    with pytest.warns(UserWarning, match=f"from the beginning, with the actor of {file}"):
+        lanes._restore(group, checkpoints)
+    begun = lanes._with_start(group, states)
+    for index in range(2):
+        actor = jax.tree.map(lambda leaf, i=index: leaf[i], begun.learner.actor)
+        assert _same(actor, run.policy(0).actor)
+    # One that is under way does not need its start, but cannot start over without it.
+    file.unlink()
+    jobs = directory.jobs("vmap")
+    add_starts(directory, jobs, write=True)
+    with pytest.raises(rtd.UserError, match=f"began from {file} cannot start over: .* be read"):
+        lanes._with_start(lanes.Group(jobs), states)
 
 
 FLAGS = [
