@@ -182,8 +182,8 @@ class Config:
     )
     actor_starts: int | None = _field(
         None,
-        "environment step at which the td3 learner begins to update the actor, if the critics must "
-        "learn first [learning_starts]",
+        "environment step at which the updates of the actor begin, if the critics must learn first "
+        "[learning_starts]",
         low=0,
     )
     precision: str = dataclasses.field(
