@@ -9,14 +9,18 @@ import dataclasses
 import math
 import warnings
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal, get_args
 
 from rtd3jax.errors import UserError, nearest
 from rtd3jax.registries import AGENTS, MEMORIES
 
-PRECISIONS = ("float32", "bfloat16")
-REPLAYS = ("windows", "segments")
-ACTINGS = ("window", "carry")
+Precision = Literal["float32", "bfloat16"]
+Replay = Literal["windows", "segments"]
+Acting = Literal["window", "carry"]
+
+PRECISIONS: tuple[Precision, ...] = get_args(Precision)
+REPLAYS: tuple[Replay, ...] = get_args(Replay)
+ACTINGS: tuple[Acting, ...] = get_args(Acting)
 
 DEFAULT_HISTORY_LENGTH = 10
 DEFAULT_SEGMENT_LENGTH = 10
@@ -128,7 +132,7 @@ class Config:
             "help": "the recurrent cell: lstm (the paper's), gru, min-gru, or a registered one"
         },
     )
-    replay: str = dataclasses.field(
+    replay: Replay = dataclasses.field(
         default="windows",
         metadata={
             "help": "how the histories of a batch are read: windows (the paper's), a separate "
@@ -150,7 +154,7 @@ class Config:
             "(experiments/segments_returns.py)"
         },
     )
-    acting: str | None = dataclasses.field(
+    acting: Acting | None = dataclasses.field(
         default=None,
         metadata={
             "help": "how the agent acts: window computes the memory from the last steps at every "
@@ -186,7 +190,7 @@ class Config:
         "[learning_starts]",
         low=0,
     )
-    precision: str = dataclasses.field(
+    precision: Precision = dataclasses.field(
         default="float32",
         metadata={
             "help": "precision of large matrix products in updates: float32, bfloat16",

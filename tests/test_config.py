@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import rtd3jax as rtd
+from rtd3jax.cli.sweep_options import overrides, parser
 
 
 @pytest.mark.parametrize(
@@ -61,6 +62,16 @@ def test_a_configuration_is_read_as_it_was_written(given):
     assert rtd.Config.from_dict(fields) == config
     del fields["actor_starts"]  # of before there was the field
     assert rtd.Config.from_dict(fields).actor_starts is None
+
+
+def test_choices_and_numbers_are_read_from_the_command_line():
+    words = "--env rover --precision bfloat16 --replay segments --acting window --gamma 0.5"
+    options = parser(None).parse_args([*words.split(), "--segment-length", "5", "--start", "7"])
+    found = overrides(options)
+    expected = dict(precision="bfloat16", replay="segments", acting="window", gamma=0.5)
+    assert found == {**expected, "segment_length": 5, "start": "7"}
+    with pytest.raises(rtd.UserError, match="acting 'widow' is unknown; did you mean 'window'"):
+        rtd.Config(acting="widow")
 
 
 @given(
