@@ -12,6 +12,7 @@ from gymnax.environments.classic_control.pendulum import EnvParams as PendulumPa
 from gymnax.environments.classic_control.pendulum import EnvState as PendulumState
 
 from rtd3jax.envs.identity import ValueIdentity, strong
+from rtd3jax.envs.pendulum.scene import PendulumScene
 from rtd3jax.envs.processes.process import float32
 
 __all__ = ["Pendulum", "PendulumParams", "PendulumState"]
@@ -37,3 +38,7 @@ class Pendulum(ValueIdentity, pendulum.Pendulum):
         limit = float32(params.max_torque)
         torque = jnp.clip(jnp.asarray(action, jnp.float32).reshape(()), -limit, limit)
         return -(theta**2 + 0.1 * observation[2] ** 2 + 0.001 * torque**2)
+
+    def scene(self, params: PendulumParams) -> PendulumScene:
+        """The drawing for the frames of an episode."""
+        return PendulumScene(params)
