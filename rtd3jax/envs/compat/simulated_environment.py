@@ -17,11 +17,14 @@ from jax.typing import ArrayLike
 
 from rtd3jax.envs.compat.host_call import host_call
 from rtd3jax.envs.compat.resets import step_with_reset
-from rtd3jax.envs.compat.simulator import Fault, Fleet, faults_of, say
+from rtd3jax.envs.compat.simulator import SEED_DIGEST, Fault, Fleet, faults_of, say
 from rtd3jax.envs.compat.simulator_state import SimulatorState
 from rtd3jax.envs.compat.surface import Surface
 from rtd3jax.envs.entry import DEFAULT_STEP_LIMIT
 from rtd3jax.envs.identity import ValueIdentity
+
+_Whole = np.ndarray | jax.Array
+"""An integer []."""
 
 
 class SimulatorParams(struct.PyTreeNode):
@@ -165,14 +168,13 @@ class FromGymnasium(ValueIdentity, environment.Environment):
         """On the host."""
         observation = np.zeros(len(self._surface.keep), np.float32)
         if not where:
-            return handle, observation, np.zeros(2, np.uint32)
+            return handle, observation, SEED_DIGEST
         try:
             found, flat, digest = self.fleet.reset(int(handle), int(seed))
         except Fault as fault:
             _report(self.name, fault)
-            lost = np.int32(fault.args[1])
-            return lost, np.full_like(observation, np.nan), np.zeros(2, np.uint32)
-        return np.int32(found), self._seen(flat), np.asarray(digest, np.uint32)
+            return fault.args[1], np.full_like(observation, np.nan), SEED_DIGEST
+        return found, self._surface.seen(flat), digest
 
     def _step(
         self,
@@ -190,27 +192,17 @@ class FromGymnasium(ValueIdentity, environment.Environment):
             if simulator is None:
                 raise Fault(_other(self.name, place[1]), found)
             with faults_of(found):
-                flat, reward, terminated, truncated = simulator.step(self._command(action))
+                flat, reward, terminated, truncated = simulator.step(self._surface.command(action))
         except Fault as fault:
             _report(self.name, fault)
-            number, lost = np.int32(fault.args[1]), np.float32(np.nan)
             nothing = np.full(len(self._surface.keep), np.nan, np.float32)
-            return number, nothing, lost, np.False_, np.False_, np.zeros(2, np.uint32), action
+            return fault.args[1], nothing, math.nan, False, False, SEED_DIGEST, action
         assert simulator.place is not None
-        digest = np.asarray(simulator.place[2], np.uint32)
-        flags = np.bool_(terminated), np.bool_(truncated)
-        return np.int32(found), self._seen(flat), np.float32(reward), *flags, digest, action
-
-    def _command(self, action: np.ndarray) -> np.ndarray:
-        box = self._surface.actions
-        wide = np.asarray(action, np.float64).reshape(box.shape)
-        return np.clip(wide, box.low, box.high).astype(box.dtype)
+        answer = self._surface.seen(flat), reward, terminated, truncated, simulator.place[2]
+        return found, *answer, action
 
     def _commands(self, rows: np.ndarray) -> Callable[[int], list[np.ndarray]]:
-        return lambda count: [self._command(row) for row in rows[:count]]
-
-    def _seen(self, flat: np.ndarray) -> np.ndarray:
-        return flat[self._surface.indices].astype(np.float32)
+        return lambda count: [self._surface.command(row) for row in rows[:count]]
 
     def restored(self, state: SimulatorState) -> SimulatorState | None:
         """A state from another process, with simulators of this one at its places, to the bit.
@@ -238,10 +230,10 @@ class FromGymnasium(ValueIdentity, environment.Environment):
         return state.replace(handle=jnp.int32(found))
 
 
-def _place(seed: ArrayLike, time: ArrayLike, digest: ArrayLike) -> tuple[int, int, tuple[int, int]]:
+def _place(seed: _Whole, time: _Whole, digest: ArrayLike) -> tuple[int, int, tuple[int, int]]:
     """Where a simulator is to be, as `Fleet.at` has it."""
     first, second = np.asarray(digest).tolist()
-    return int(np.asarray(seed)), int(np.asarray(time)), (first, second)
+    return int(seed), int(time), (first, second)
 
 
 def _other(name: str, steps: int) -> str:

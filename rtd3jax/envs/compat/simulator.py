@@ -9,13 +9,16 @@ import atexit
 import contextlib
 import hashlib
 import itertools
+import math
 import queue
+import struct
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
+from jax.typing import ArrayLike
 
 from rtd3jax.errors import UserError, first_line
 
@@ -110,10 +113,10 @@ class Simulator:
             )
         observation = self._observation("step", answer[0])
         try:
-            reward = float(np.asarray(answer[1], np.float64).reshape(()))
+            reward = float(answer[1]) if isinstance(answer[1], float) else _number(answer[1])
         except (TypeError, ValueError):
             raise self._wrong(f"the reward {answer[1]!r} is not a number") from None
-        if not np.isfinite(reward):
+        if not math.isfinite(reward):
             raise self._wrong(f"the reward is {reward}")
         self.place = seed, time + 1, _digest(digest, observation, reward)
         return observation, reward, bool(answer[2]), bool(answer[3])
@@ -159,11 +162,15 @@ class Simulator:
         return Fault(self.fault)
 
 
-def _digest(before: Sequence[int], observation: np.ndarray, reward: float) -> tuple[int, int]:
-    text = np.asarray(before, np.uint32).tobytes() + observation.tobytes()
-    code = hashlib.blake2b(text + np.float64(reward).tobytes(), digest_size=8).digest()
-    first, second = np.frombuffer(code, np.uint32)
-    return int(first), int(second)
+def _number(reward: ArrayLike) -> float:
+    """A reward of any numeric type, also as an array of one element."""
+    return float(np.asarray(reward, np.float64).reshape(()))
+
+
+def _digest(before: tuple[int, int], observation: np.ndarray, reward: float) -> tuple[int, int]:
+    text = struct.pack("=2I", *before) + observation.tobytes() + struct.pack("=d", reward)
+    first, second = struct.unpack("=2I", hashlib.blake2b(text, digest_size=8).digest())
+    return first, second
 
 
 @contextlib.contextmanager

@@ -1,6 +1,7 @@
 """The outside of a Gymnasium environment: its actions, and a vector of what it shows."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -21,10 +22,25 @@ class Surface:
     keep: tuple[int, ...]
     limit: int
 
-    @property
+    @functools.cached_property
     def indices(self) -> np.ndarray:
-        """As an index."""
+        """The elements that are seen, as an index."""
         return np.asarray(self.keep)
+
+    @functools.cached_property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest action, float64."""
+        return self.actions.low.astype(np.float64), self.actions.high.astype(np.float64)
+
+    def command(self, action: np.ndarray) -> np.ndarray:
+        """What the environment is given for an ``action`` [A]: within its bounds, in its type."""
+        low, high = self.bounds
+        wide = action.astype(np.float64).reshape(low.shape)
+        return np.minimum(np.maximum(wide, low), high).astype(self.actions.dtype)
+
+    def seen(self, flat: np.ndarray) -> np.ndarray:
+        """The kept elements of all that it showed, float32 [O]."""
+        return flat[self.indices].astype(np.float32)
 
 
 def surface_of(
