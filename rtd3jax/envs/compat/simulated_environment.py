@@ -22,6 +22,7 @@ from rtd3jax.envs.compat.simulator_state import SimulatorState
 from rtd3jax.envs.compat.surface import Surface
 from rtd3jax.envs.entry import DEFAULT_STEP_LIMIT
 from rtd3jax.envs.identity import ValueIdentity
+from rtd3jax.errors import UserError
 
 _Whole = np.ndarray | jax.Array
 """An integer []."""
@@ -192,6 +193,8 @@ class FromGymnasium(ValueIdentity, environment.Environment):
             if simulator is None:
                 raise Fault(_other(self.name, place[1]), found)
             with faults_of(found):
+                if place[1] >= self._surface.limit:
+                    raise simulator.failed(self._too_long("its episode goes on"))
                 flat, reward, terminated, truncated = simulator.step(self._surface.command(action))
         except Fault as fault:
             _report(self.name, fault)
@@ -200,6 +203,20 @@ class FromGymnasium(ValueIdentity, environment.Environment):
         assert simulator.place is not None
         answer = self._surface.seen(flat), reward, terminated, truncated, simulator.place[2]
         return found, *answer, action
+
+    def check_params(self, params: SimulatorParams) -> None:
+        """Raise UserError where episodes would be longer than those that its state can hold."""
+        limit = params.max_steps_in_episode
+        if isinstance(limit, jax.core.Tracer):
+            return  # the simulator itself refuses
+        if int(limit) > self._surface.limit:
+            raise UserError(f"{self.name}: {self._too_long(f'max_steps_in_episode={limit} is')}")
+
+    def _too_long(self, what: str) -> str:
+        return (
+            f"{what} beyond the {self._surface.limit:,} steps with which it was made; give "
+            "rtd.from_gymnasium a larger max_steps_in_episode"
+        )
 
     def _commands(self, rows: np.ndarray) -> Callable[[int], list[np.ndarray]]:
         return lambda count: [self._surface.command(row) for row in rows[:count]]

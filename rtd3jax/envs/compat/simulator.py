@@ -92,7 +92,7 @@ class Simulator:
             self._env = self._call("the factory", self._make)
         answer = self._call("reset", lambda: self._env.reset(seed=seed))
         if not isinstance(answer, tuple) or len(answer) != 2:
-            raise self._wrong("reset must return (observation, info)")
+            raise self.failed("reset must return (observation, info)")
         observation = self._observation("reset", answer[0])
         self.place = seed, 0, _digest(SEED_DIGEST, observation, 0.0)
         return observation
@@ -107,7 +107,7 @@ class Simulator:
         answer = self._call("step", lambda: self._env.step(action))
         count = len(answer) if isinstance(answer, tuple) else 1
         if count != 5:
-            raise self._wrong(
+            raise self.failed(
                 f"step returned {count} values; it must return (observation, reward, terminated, "
                 "truncated, info)"
             )
@@ -115,9 +115,9 @@ class Simulator:
         try:
             reward = float(answer[1]) if isinstance(answer[1], float) else _number(answer[1])
         except (TypeError, ValueError):
-            raise self._wrong(f"the reward {answer[1]!r} is not a number") from None
+            raise self.failed(f"the reward {answer[1]!r} is not a number") from None
         if not math.isfinite(reward):
-            raise self._wrong(f"the reward is {reward}")
+            raise self.failed(f"the reward is {reward}")
         self.place = seed, time + 1, _digest(digest, observation, reward)
         return observation, reward, bool(answer[2]), bool(answer[3])
 
@@ -132,34 +132,35 @@ class Simulator:
                 self._thread.do(self._env.close, min(_CLOSING_SECONDS, self._seconds))
         self._thread.end()
 
+    def failed(self, message: str) -> Fault:
+        """What is to be raised of it now, and whenever it is asked again."""
+        self.fault = f"the simulator failed: {message}"
+        return Fault(self.fault)
+
     def _call(self, what: str, call: Callable[[], Any]) -> Any:
         if self.fault is not None:
             raise Fault(self.fault)
         try:
             return self._thread.do(call, self._seconds)
         except TimeoutError:
-            raise self._wrong(
+            raise self.failed(
                 f"{what} did not return within {self._seconds:g} s (step_seconds=...)"
             ) from None
         except UserError as error:
-            raise self._wrong(str(error)) from error
+            raise self.failed(str(error)) from error
         except BaseException as error:
             message = f"{type(error).__name__}: {first_line(error)}"
-            raise self._wrong(f"{what} raised {message}") from error
+            raise self.failed(f"{what} raised {message}") from error
 
     def _observation(self, what: str, observation: object) -> np.ndarray:
         try:
             flat = self._read(observation)
         except (TypeError, ValueError, KeyError, IndexError) as error:
-            raise self._wrong(f"the observation of {what} is unfit: {first_line(error)}") from None
+            raise self.failed(f"the observation of {what} is unfit: {first_line(error)}") from None
         if not np.isfinite(flat).all():
             where = int(np.argmin(np.isfinite(flat)))
-            raise self._wrong(f"element {where} of the observation of {what} is {flat[where]}")
+            raise self.failed(f"element {where} of the observation of {what} is {flat[where]}")
         return flat
-
-    def _wrong(self, message: str) -> Fault:
-        self.fault = f"the simulator failed: {message}"
-        return Fault(self.fault)
 
 
 def _number(reward: ArrayLike) -> float:

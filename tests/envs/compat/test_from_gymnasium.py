@@ -283,6 +283,31 @@ def test_a_longer_time_limit_than_the_ids_own():
     close_simulators()
 
 
+def test_an_episode_longer_than_the_log_of_actions_is_refused():
+    env = rtd.from_gymnasium("Pendulum-v1", max_steps_in_episode=3)
+    longer = env.default_params.replace(max_steps_in_episode=4)
+    policy = rtd.constant_policy([0.5])
+    disturbed = rtd.disturb(env, rtd.Delay())
+    for made, params in (
+        (env, longer),
+        (disturbed, disturbed.default_params.replace(env=longer)),
+    ):
+        with pytest.raises(rtd.UserError, match="=4 is beyond the 3 steps with .* a larger max_"):
+            rtd.evaluate(policy, made, 1, params=params)
+    shorter = env.default_params.replace(max_steps_in_episode=2)
+    assert rtd.rollout(policy, env, 1, params=shorter).lengths[0] == 2
+    # Where the parameters are traced the simulator itself refuses.
+    _, state = env.reset(jax.random.key(0), longer)
+    step = jax.jit(env.step_env)
+    with pytest.warns(UserWarning, match="its episode goes on beyond the 3 steps"):
+        for _ in range(4):
+            observation, state, *_ = jax.block_until_ready(
+                step(jax.random.key(1), state, jnp.zeros(1), longer)
+            )
+    assert np.isnan(observation).all() and "3 steps" in env.fleet.fault(int(state.handle))
+    close_simulators()
+
+
 def test_tables_that_print_alike_are_two_environments():
     def make(table):
         return gymnasium.make("Pendulum-v1")
