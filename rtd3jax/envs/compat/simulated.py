@@ -16,6 +16,12 @@ def innermost(env: object) -> object:
     return env
 
 
+def fleet_of(env: object) -> Fleet | None:
+    """The simulators of the environment, disturbed or not; None where it has none."""
+    base = innermost(env)
+    return base.fleet if isinstance(base, FromGymnasium) else None
+
+
 def is_simulated(env: object) -> bool:
     """Whether a simulator on the host plays the environment, disturbed or not."""
     return isinstance(innermost(env), FromGymnasium)

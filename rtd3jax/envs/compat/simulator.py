@@ -14,7 +14,7 @@ import queue
 import struct
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -199,6 +199,7 @@ class Fleet:
         self._lock = threading.Lock()
         self._busy: dict[int, Simulator] = {}
         self._free: list[Simulator] = []
+        self._users = 0
         _fleets.append(self)
 
     def reset(self, handle: int, seed: int) -> tuple[int, np.ndarray, tuple[int, int]]:
@@ -245,6 +246,37 @@ class Fleet:
             if simulator is not None and simulator.fault is None:
                 del self._busy[handle]
                 self._free.append(simulator)
+
+    @contextlib.contextmanager
+    def in_use(self) -> Iterator[None]:
+        """While anyone is within, free simulators stay open for further episodes.
+
+        Then they are closed, and those that failed, which are of no use to anyone. Others that are
+        busy stay open: they may be another's.
+        """
+        with self._lock:
+            self._users += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._users -= 1
+                idle: list[Simulator] = []
+                if not self._users:
+                    idle = [s for s in self._busy.values() if s.fault is not None]
+                    idle, self._free = [*idle, *self._free], []
+            for simulator in idle:
+                simulator.close()
+
+    def drop(self, handles: Iterable[int]) -> None:
+        """Close these; one that failed keeps its fault, for whoever asks what became of it."""
+        with self._lock:
+            own = {handle: self._busy[handle] for handle in handles if handle in self._busy}
+            for handle, simulator in own.items():
+                if simulator.fault is None:
+                    del self._busy[handle]
+        for simulator in own.values():
+            simulator.close()
 
     def close(self) -> None:
         """Close all; a place that is asked for later is replayed."""

@@ -3,6 +3,7 @@
 from typing import Any
 
 import jax
+import numpy as np
 from flax import struct
 
 
@@ -29,6 +30,12 @@ def simulator_state(env_state: object) -> SimulatorState | None:
     """The part of an environment's state that is a simulator's; None where there is none."""
     parts = jax.tree.leaves(env_state, is_leaf=lambda part: isinstance(part, SimulatorState))
     return next((part for part in parts if isinstance(part, SimulatorState)), None)
+
+
+def simulator_handles(env_state: object) -> list[int]:
+    """Of the simulators that play a state, or several; empty where none do."""
+    found = simulator_state(env_state)
+    return [] if found is None else np.asarray(found.handle).reshape(-1).tolist()
 
 
 def with_simulator(env_state: object, simulator: SimulatorState) -> Any:
