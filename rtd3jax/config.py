@@ -8,14 +8,19 @@ of the published TD3 (Fujimoto et al., 2018) and LSTM-TD3 (Meng et al., 2021).
 import dataclasses
 import math
 import warnings
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Literal, get_args
 
 from rtd3jax.errors import UserError, nearest
 from rtd3jax.registries import AGENTS, MEMORIES
 
-PRECISIONS = ("float32", "bfloat16")
-REPLAYS = ("windows", "segments")
-ACTINGS = ("window", "carry")
+Precision = Literal["float32", "bfloat16"]
+Replay = Literal["windows", "segments"]
+Acting = Literal["window", "carry"]
+
+PRECISIONS: tuple[Precision, ...] = get_args(Precision)
+REPLAYS: tuple[Replay, ...] = get_args(Replay)
+ACTINGS: tuple[Acting, ...] = get_args(Acting)
 
 DEFAULT_HISTORY_LENGTH = 10
 DEFAULT_SEGMENT_LENGTH = 10
@@ -127,7 +132,7 @@ class Config:
             "help": "the recurrent cell: lstm (the paper's), gru, min-gru, or a registered one"
         },
     )
-    replay: str = dataclasses.field(
+    replay: Replay = dataclasses.field(
         default="windows",
         metadata={
             "help": "how the histories of a batch are read: windows (the paper's), a separate "
@@ -149,7 +154,7 @@ class Config:
             "(experiments/segments_returns.py)"
         },
     )
-    acting: str | None = dataclasses.field(
+    acting: Acting | None = dataclasses.field(
         default=None,
         metadata={
             "help": "how the agent acts: window computes the memory from the last steps at every "
@@ -181,11 +186,11 @@ class Config:
     )
     actor_starts: int | None = _field(
         None,
-        "environment step at which the td3 learner begins to update the actor, if the critics must "
-        "learn first [learning_starts]",
+        "environment step at which the updates of the actor begin, if the critics must learn first "
+        "[learning_starts]",
         low=0,
     )
-    precision: str = dataclasses.field(
+    precision: Precision = dataclasses.field(
         default="float32",
         metadata={
             "help": "precision of large matrix products in updates: float32, bfloat16",
@@ -218,8 +223,6 @@ class Config:
         if self.replay == "segments":
             self._check_segments()
         self._check_environments(capacity)
-        if self.actor_starts is None:
-            object.__setattr__(self, "actor_starts", self.learning_starts)
         for name in ("start", "freeze"):
             if not isinstance(getattr(self, name), str):
                 raise UserError(f"{name} must be a string, not {getattr(self, name)!r}")
@@ -396,10 +399,14 @@ class Config:
         return -(-steps // self.steps_per_round) * self.updates_per_round
 
     @property
+    def first_actor_step(self) -> int:
+        """The environment step from which on the actor is updated."""
+        return self.learning_starts if self.actor_starts is None else self.actor_starts
+
+    @property
     def updates_before_the_actor(self) -> int:
         """Critic updates before the actor is first updated."""
-        assert self.actor_starts is not None  # resolved when it was made
-        return max(0, -(-(self.actor_starts - self.learning_starts) // self.update_every))
+        return max(0, -(-(self.first_actor_step - self.learning_starts) // self.update_every))
 
     @property
     def capacity(self) -> int:
@@ -408,8 +415,23 @@ class Config:
         return self.replay_capacity
 
     def to_dict(self) -> dict[str, Any]:
-        """The fields as JSON-ready values."""
-        return dataclasses.asdict(self)
+        """The fields as JSON-ready values, with the step at which the actor does start."""
+        return {**dataclasses.asdict(self), "actor_starts": self.first_actor_step}
+
+    @classmethod
+    def from_dict(cls, fields: Mapping[str, Any]) -> "Config":
+        """The configuration that `to_dict` wrote, in this version or an earlier one.
+
+        An actor that starts when learning does is taken for one that was not told when.
+
+        Raises:
+            UserError: when a value is impossible.
+            TypeError: when there is no such field.
+        """
+        given = dict(fields)
+        if given.get("actor_starts") == given.get("learning_starts", cls.learning_starts):
+            del given["actor_starts"]
+        return cls(**given)
 
 
 def traced_fields() -> tuple[str, ...]:

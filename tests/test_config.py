@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import rtd3jax as rtd
+from rtd3jax.cli.sweep_options import overrides, parser
 
 
 @pytest.mark.parametrize(
@@ -42,6 +43,35 @@ def test_a_history_length_on_td3_warns():
 def test_a_resolved_configuration_is_a_fixed_point():
     config = rtd.Config(algorithm="h-td3")
     assert dataclasses.replace(config) == config and config.replay_capacity == config.total_steps
+
+
+def test_the_actor_starts_with_learning_unless_it_is_told_when():
+    config = rtd.Config()
+    later = dataclasses.replace(config, learning_starts=5_000)
+    assert (config.first_actor_step, later.first_actor_step) == (1_000, 5_000)
+    assert later.updates_before_the_actor == 0
+    told = dataclasses.replace(rtd.Config(actor_starts=1_000), learning_starts=500)
+    assert told.first_actor_step == 1_000 and told.updates_before_the_actor == 500
+
+
+@pytest.mark.parametrize("given", [{}, {"actor_starts": 3_000}, {"learning_starts": 2_000}])
+def test_a_configuration_is_read_as_it_was_written(given):
+    config = rtd.Config(**given)
+    fields = config.to_dict()
+    assert fields["actor_starts"] == config.first_actor_step  # a number, as it always was
+    assert rtd.Config.from_dict(fields) == config
+    del fields["actor_starts"]  # of before there was the field
+    assert rtd.Config.from_dict(fields).actor_starts is None
+
+
+def test_choices_and_numbers_are_read_from_the_command_line():
+    words = "--env rover --precision bfloat16 --replay segments --acting window --gamma 0.5"
+    options = parser(None).parse_args([*words.split(), "--segment-length", "5", "--start", "7"])
+    found = overrides(options)
+    expected = dict(precision="bfloat16", replay="segments", acting="window", gamma=0.5)
+    assert found == {**expected, "segment_length": 5, "start": "7"}
+    with pytest.raises(rtd.UserError, match="acting 'widow' is unknown; did you mean 'window'"):
+        rtd.Config(acting="widow")
 
 
 @given(

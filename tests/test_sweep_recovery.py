@@ -120,6 +120,30 @@ def test_killed_while_it_writes(part, times, whole, tmp_path):
     assert not list(out.rglob("checkpoints/**/*.tmp"))
 
 
+@pytest.mark.slow
+def test_a_killed_simulators_lanes_end_with_the_same_bits(tmp_path):
+    """A checkpoint falls into an episode, which is replayed in a simulator of the new process."""
+    out = tmp_path / "run"
+    study = [
+        *("--env", "gymnasium:Pendulum-v1", "--algorithms", "td3", "lstm-td3-1ha1hc"),
+        *("--history-lengths", "2", "--seeds", "2", "--total-steps", "400", "--hidden-size", "8"),
+        *("--batch-size", "4", "--learning-starts", "10", "--eval-every", "150"),
+        *("--eval-episodes", "1", "--final-episodes", "2", "--quiet", "--no-report"),
+        *("--checkpoint-every", "100steps"),
+    ]
+    assert sweep.main([*study, "--out", str(tmp_path / "whole")]) == 0
+    dying = subprocess.run(
+        [sys.executable, "-c", DYING, "step-", "7", *study, "--out", str(out)],
+        env=cached(),
+        capture_output=True,
+    )
+    assert dying.returncode == -signal.SIGKILL, dying.stderr.decode()[-2000:]
+    kept = {int(file.stem.partition("-")[2]) for file in out.rglob("step-*.safetensors")}
+    assert any(step % 200 for step in kept), kept  # an episode has 200 steps
+    assert sweep.main([*study, "--out", str(out)]) == 0
+    assert contents(out) == contents(tmp_path / "whole")
+
+
 def test_sigterm_leaves_checkpoints_and_the_rest_is_the_same(whole, tmp_path, monkeypatch, capsys):
     out = tmp_path / "run"
     real = recorder.Recorder.update

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import jax
 
-from rtd3jax.agents.freeze import check_parts, frozen_parts
+from rtd3jax.agents.freeze import check_parts, frozen_parts, waiting_actor
 from rtd3jax.agents.history import Window, next_window
 from rtd3jax.agents.hyperparameters import Hyperparameters
 from rtd3jax.agents.learners.base import Learner, Metrics, Networks
@@ -194,6 +194,9 @@ class Agent:
         new, metrics = self.learner.update(
             self.networks, state, batch, keys, hyperparameters, count
         )
+        waits = self.config.updates_before_the_actor
+        if waits:
+            new = waiting_actor(state, new, count > waits)
         return frozen_parts(state, new, self.config.frozen), metrics
 
 

@@ -1,8 +1,11 @@
-"""Parts of the networks that are not trained, such as ``actor.memory``."""
+"""Parts of the networks that are not trained, such as ``actor.memory``, or not from the start."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
 
 from rtd3jax.agents.memory.base import Params
 from rtd3jax.agents.networks import LAYERS, Network
@@ -13,6 +16,9 @@ State = TypeVar("State")
 
 Weights = Params | tuple[Params, ...]
 """The weights of one network, or of several networks of the same kind."""
+
+WITH_THE_ACTOR = "target_actor", "actor_optimizer"
+"""Fields of a learner's state that start with the actor, if it has them."""
 
 
 def check_parts(parts: Sequence[str], networks: Mapping[str, Network]) -> None:
@@ -35,6 +41,22 @@ def frozen_parts(before: State, after: State, parts: Sequence[str]) -> State:
     for part in parts:
         whose, _, layer = part.partition(".")
         kept[whose] = _kept(getattr(before, whose), kept.get(whose, getattr(after, whose)), layer)
+    changed: Any = after
+    return dataclasses.replace(changed, **kept)
+
+
+def waiting_actor(before: State, after: State, learns: jax.Array) -> State:
+    """The learner's state ``after`` an update, with the actor of ``before`` unless it ``learns``.
+
+    ``learns`` is a bool []. The fields in `WITH_THE_ACTOR` are treated as the actor is; all others
+    are updated.
+    """
+
+    def either(new: jax.Array, old: jax.Array) -> jax.Array:
+        return jnp.where(learns, new, old)
+
+    names = [name for name in ("actor", *WITH_THE_ACTOR) if hasattr(before, name)]
+    kept = {n: jax.tree.map(either, getattr(after, n), getattr(before, n)) for n in names}
     changed: Any = after
     return dataclasses.replace(changed, **kept)
 

@@ -29,8 +29,8 @@ from rtd3jax.study.loggers import check_loggers, open_loggers
 from rtd3jax.study.memory_plan import lanes_at_once, usable_memory
 from rtd3jax.study.plan import make_cells, plan_text
 from rtd3jax.study.references import references_of
-from rtd3jax.study.rundir import RunDirectory
-from rtd3jax.study.starts import add_starts
+from rtd3jax.study.rundir import RunDirectory, holds_study
+from rtd3jax.study.starts import add_starts, check_starts_stay
 from rtd3jax.study.status import ledger
 from rtd3jax.system.imports import import_modules
 from rtd3jax.training.lanes import Job, workers
@@ -94,6 +94,8 @@ def _run(options: argparse.Namespace) -> int:
         )
     out = sweep_options.out(options)
     directory = RunDirectory(out, cells, seeds, episodes, prepare=False)
+    if options.fresh and holds_study(out):
+        check_starts_stay(cells, out)
     additions = "" if options.fresh else directory.plan()
     jobs = directory.jobs(strategy)
     if options.dry_run:
@@ -107,7 +109,8 @@ def _run(options: argparse.Namespace) -> int:
         at_once = lanes_at_once(jobs, strategy, len(workers()), usable_memory())
     interval = sweep_options.parse_interval(options.checkpoint_every)
     shard = _shard(options)
-    add_starts(directory, jobs, write=False)  # raises UserError before any file is written
+    # Raises UserError before any file is written.
+    add_starts(directory, jobs, write=False, fresh=options.fresh)
     if options.fresh:
         _set_aside(out)
     if additions := directory.prepare():
@@ -169,7 +172,7 @@ def _train(
 
 def _set_aside(out: Path) -> None:
     """Rename a run directory, so that its lanes are kept."""
-    if not (out / "config.json").exists():
+    if not holds_study(out):
         return
     with writer(out, None):
         for number in range(1, 10_000):

@@ -5,7 +5,7 @@ import dataclasses
 import math
 import re
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, Literal, NoReturn, get_args, get_origin
 
 import jax
 
@@ -134,14 +134,21 @@ def parser(description: str | None) -> argparse.ArgumentParser:
                 switch = argparse.BooleanOptionalAction
                 config.add_argument(flag, action=switch, default=None, help=help)
                 continue
-            kind = next((k for k in (str, float) if k.__name__ in _type_name(field)), int)
+            kind = _kind(field.type)
             metavar = "NAME" if kind is str else "N"
             config.add_argument(flag, type=kind, metavar=metavar, help=help)
     return found
 
 
-def _type_name(field: dataclasses.Field) -> str:
-    return getattr(field.type, "__name__", str(field.type))
+def _kind(hint: object) -> type:
+    """What a field of this type reads from the command line: text, or a number."""
+    if get_origin(hint) is Literal:
+        return str
+    parts = [part for part in get_args(hint) if part is not type(None)]
+    if parts:
+        return _kind(parts[0])
+    assert isinstance(hint, type)
+    return hint
 
 
 def grids(options: argparse.Namespace) -> list[Grid]:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from rtd3jax.envs.compat.from_gymnasium import without_handles
+from rtd3jax.envs.compat.simulator_state import without_handles
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import (
     DEFAULT_STEP_LIMIT,

@@ -8,7 +8,8 @@ from flax import struct
 from gymnax.environments import environment, spaces
 from jax.typing import ArrayLike
 
-from rtd3jax.envs.compat.from_gymnasium import is_simulated, step_with_reset
+from rtd3jax.envs.compat.resets import step_with_reset
+from rtd3jax.envs.compat.simulated import is_simulated
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.identity import ValueIdentity, strong
 from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT, describe, foreign_code

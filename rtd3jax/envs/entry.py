@@ -22,12 +22,19 @@ def parameters_of(env: EnvironmentLike, params: object = None) -> Any:
     Every function that takes an environment calls this first.
 
     Raises:
-        UserError: if ``env`` is not a gymnax >= 1.0 environment, if a disturbance cannot act in its
-            episodes, or if one of JAX's switches prevents evaluation and training.
+        UserError: if ``env`` is not a gymnax >= 1.0 environment, if its method ``check_params``
+            refuses the parameters, if a disturbance cannot act in its episodes, or if one of JAX's
+            switches prevents evaluation and training.
     """
     check_switches()
     params = own_parameters(env, params)
     check_uses(params, DEFAULT_STEP_LIMIT)
+    base: Any = env
+    own = params
+    while hasattr(base, "base"):  # the wrapped environment
+        base, own = base.base, getattr(own, "env", own)
+    if callable(check := getattr(base, "check_params", None)):
+        check(own)
     return params
 
 

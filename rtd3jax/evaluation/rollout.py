@@ -5,7 +5,7 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from rtd3jax.envs.compat.from_gymnasium import release
+from rtd3jax.envs.compat.simulated import release
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT, describe, foreign_code
 from rtd3jax.errors import UserError

@@ -19,6 +19,8 @@ SHORTEST = 8
 """Rows with which a wave of three parameters and an offset can be told from noise."""
 TRIED = 3
 """Periods from which the least squares start: the best of the profile."""
+_FINENESS = 8
+"""Periods of the profile for each cycle more that the wave may have."""
 
 
 def fit_sine(parts: Sequence[np.ndarray], max_slip: float | None = None) -> Fit:
@@ -134,7 +136,7 @@ def _fit_wave(wave: np.ndarray, bound: float) -> "OptimizeResult":
             x_scale=[bound, bound, 1.0 / len(wave), bound],
             max_nfev=60,
         )
-        for start in _starts(wave, time)
+        for start in _starts(wave)
     ]
     return min(found, key=lambda fit: fit.cost)
 
@@ -161,23 +163,45 @@ def _limits(time: np.ndarray, bound: float) -> tuple[np.ndarray, np.ndarray]:
     return np.array(low), np.array(high)
 
 
-def _starts(wave: np.ndarray, time: np.ndarray) -> list[np.ndarray]:
+def _starts(wave: np.ndarray) -> list[np.ndarray]:
     """Parameters at the lowest dips of the profile over the period, from 3 steps to twice all."""
-    cycles = np.arange(0.5, len(wave) / 3.0, 0.125)
-    angles = 2.0 * np.pi * cycles / len(wave)
-    turns = angles[:, None] * time
-    regressors = np.stack((np.sin(turns), np.cos(turns), np.ones_like(turns)), axis=-1)
-    normal = np.einsum("pti,ptj->pij", regressors, regressors) + 1e-9 * np.eye(3)
+    angles, coefficients, explained = _profile(wave)
     centre = wave.mean()
-    right = np.einsum("pti,t->pi", regressors, wave - centre)
-    coefficients = np.linalg.solve(normal, right[..., None])[..., 0]
-    explained = np.sum(coefficients * right, axis=1)
     sides = np.concatenate([[-np.inf], explained, [-np.inf]])
     peaks = np.flatnonzero((explained >= sides[:-2]) & (explained >= sides[2:]))
     # A dip that is half as deep as the lowest is the window's, or another wave's.
     peaks = peaks[explained[peaks] >= 0.5 * explained.max()]
     best = peaks[np.argsort(-explained[peaks])][:TRIED]
     return [np.array([*coefficients[p][:2], angles[p], coefficients[p][2] + centre]) for p in best]
+
+
+def _profile(wave: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The line in sine and cosine that explains most of a ``wave`` [T], for each of P periods.
+
+    The periods lie an eighth of a cycle apart, so that all sums over the rows stand in a Fourier
+    transform of the wave, padded to eight times its length: memory grows with T, not with P T.
+
+    Returns:
+        angle per step [P]; coefficients [P, 3] of sine, cosine and one, about the wave's mean; how
+        much of the sum of squares each explains [P].
+    """
+    count = len(wave)
+    bins = np.arange(4, math.ceil(_FINENESS * count / 3.0))
+    sums = np.fft.fft(wave - wave.mean(), _FINENESS * count)
+    ones = np.fft.fft(np.ones(count), _FINENESS * count)
+    # The transform turns the other way: its imaginary part is minus the sum of sines.
+    right = np.stack([-sums[bins].imag, sums[bins].real, np.full(len(bins), sums[0].real)], axis=1)
+    sine, cosine, twice = -ones[bins].imag, ones[bins].real, ones[2 * bins]
+    both = -0.5 * twice.imag
+    rows = [
+        (0.5 * (count - twice.real), both, sine),
+        (both, 0.5 * (count + twice.real), cosine),
+        (sine, cosine, np.full(len(bins), float(count))),
+    ]
+    normal = np.stack([np.stack(row, axis=-1) for row in rows], axis=1) + 1e-9 * np.eye(3)
+    coefficients = np.linalg.solve(normal, right[..., None])[..., 0]
+    angles = 2.0 * np.pi * bins / (_FINENESS * count)
+    return angles, coefficients, np.sum(coefficients * right, axis=1)
 
 
 def _variance(residuals: Sequence[np.ndarray], parameters: int) -> float:

@@ -16,7 +16,7 @@ from rtd3jax.agents.bounds import Bounds
 from rtd3jax.agents.memory.base import Params
 from rtd3jax.agents.networks import NetworkSpec, init_network, part_sizes
 from rtd3jax.agents.normalise import Normaliser
-from rtd3jax.config import ACTINGS
+from rtd3jax.config import ACTINGS, Acting
 from rtd3jax.envs.interface import Interface
 from rtd3jax.errors import UserError
 from rtd3jax.policies.trained import CARRY_FORMAT, FORMAT, KIND, NORMALISED_FORMAT, Policy
@@ -66,7 +66,7 @@ def restore_policy(
     history_length: int,
     width: int,
     memory: str = "lstm",
-    acting: str = "window",
+    acting: Acting = "window",
     format: int = FORMAT,
     centre_token: np.ndarray | None = None,
     normaliser: Mapping[str, np.ndarray] | None = None,

@@ -14,6 +14,7 @@ from rtd3jax.agents.history import Steps, empty_steps, present, put_step, window
 from rtd3jax.agents.memory.base import Carry, Params
 from rtd3jax.agents.networks import Network, act, advance
 from rtd3jax.agents.normalise import Normaliser, as_read
+from rtd3jax.config import Acting
 from rtd3jax.errors import UserError
 from rtd3jax.policies.export.formats import writer_of
 from rtd3jax.policies.export.model import Model, fold
@@ -81,7 +82,7 @@ class Policy:
     observation_size: int = struct.field(pytree_node=False)
     action_shape: tuple[int, ...] = struct.field(pytree_node=False)
     memory: str = struct.field(pytree_node=False, default="lstm")
-    acting: str = struct.field(pytree_node=False, default="window")
+    acting: Acting = struct.field(pytree_node=False, default="window")
     normaliser: Normaliser | None = None
 
     @property

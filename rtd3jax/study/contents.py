@@ -164,7 +164,7 @@ def _with_more_steps(there: Cell, asked: Cell) -> Cell:
     for name in before:
         if before[name] != after[name] and not (longer and name in LONGER):
             raise UserError(f"{name}: {before[name]} there, {after[name]} here")
-    return asked
+    return asked if longer else there
 
 
 def _unusual(there: Contents, added: Sequence[Cell]) -> str:

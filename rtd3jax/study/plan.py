@@ -63,7 +63,7 @@ class Cell:
     def from_dict(cls, fields: dict[str, Any]) -> "Cell":
         """The cell that `to_dict` wrote."""
         config = {name: value for name, value in fields.items() if name not in _OWN_FIELDS}
-        return cls(fields["env"], fields["disturbance"], Config(**config))
+        return cls(fields["env"], fields["disturbance"], Config.from_dict(config))
 
 
 def label(job: Job) -> str:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from rtd3jax.envs.compat.from_gymnasium import is_simulated
+from rtd3jax.envs.compat.simulated import is_simulated
 from rtd3jax.envs.registry import description_of
 from rtd3jax.errors import UserError, first_line
 from rtd3jax.evaluation.rollout import both_returns

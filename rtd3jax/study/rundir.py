@@ -219,6 +219,11 @@ class RunDirectory:
                 )
 
 
+def holds_study(path: Path) -> bool:
+    """Whether a study was begun in the directory."""
+    return (path / CONFIG).exists()
+
+
 def _is_own(entry: Path) -> bool:
     """Whether ``entry`` may exist in a directory without a study.
 

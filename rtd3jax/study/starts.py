@@ -1,6 +1,7 @@
 """What the lanes of a cell go on from: lanes of another run directory, or a saved policy."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 from rtd3jax.errors import UserError
 from rtd3jax.study.plan import Cell
@@ -11,23 +12,30 @@ from rtd3jax.training.lanes import Job
 from rtd3jax.training.start import Start, starts_of_path
 
 
-def add_starts(directory: RunDirectory, jobs: Sequence[Job], *, write: bool) -> None:
-    """Give each job that is still to begin what it goes on from, and see that it can.
+def add_starts(
+    directory: RunDirectory, jobs: Sequence[Job], *, write: bool, fresh: bool = False
+) -> None:
+    """Give each job that is not done what it began from, and see that those can that are new.
+
+    One that is under way has checkpoints, and may start over where they are of no use.
 
     Args:
         directory: of the study.
         jobs: of its lanes.
         write: whether to note what each begins from, beside its lane.
+        fresh: whether all are to begin, whatever is in the directory now.
 
     Raises:
         UserError: as `starts_of` does, or when it is of another agent or other sizes.
     """
     by_cell: dict[Cell, list[Job]] = {}
     for job in jobs:
-        if not job.cell.config.start or directory.lanes.is_done(*job.key):
+        if not job.cell.config.start or not fresh and directory.lanes.is_done(*job.key):
             continue
-        if not checkpoint_files(directory.lanes.checkpoint_directory(*job.key)):
+        if fresh or not checkpoint_files(directory.lanes.checkpoint_directory(*job.key)):
             by_cell.setdefault(job.cell, []).append(job)
+        elif job.start is None:
+            job.start = _start_or_why_not(job.cell, job.seed)
     for cell, own in by_cell.items():
         new = [job for job in own if job.start is None]
         starts = starts_of(cell, [job.seed for job in new])
@@ -39,6 +47,30 @@ def add_starts(directory: RunDirectory, jobs: Sequence[Job], *, write: bool) -> 
                 directory.lanes.write_start(cell, job.seed, job.start.about)
 
 
+def _start_or_why_not(cell: Cell, seed: int) -> Start:
+    try:
+        return starts_of(cell, [seed])[seed]
+    except UserError as error:
+        return Start(cell.config.start, missing=str(error))
+
+
+def check_starts_stay(cells: Iterable[Cell], out: Path) -> None:
+    """Raise UserError where a cell begins from what ``--fresh`` moves away with ``out``."""
+    for start in dict.fromkeys(cell.config.start for cell in cells if cell.config.start):
+        if _place(start)[0].resolve().is_relative_to(out.resolve()):
+            raise UserError(
+                f"--start {start} lies in {out}, which --fresh moves away: give another --out, or "
+                "move that directory yourself and start from where it is then"
+            )
+
+
+def _place(start: str) -> tuple[Path, str]:
+    """The path that ``start`` of a configuration names, and of which disturbance ("" for any)."""
+    path, _, disturbance = start.partition("@")
+    directory = user_path(path)
+    return (directory, disturbance) if directory.is_dir() else (user_path(start), "")
+
+
 def starts_of(cell: Cell, seeds: Sequence[int]) -> dict[int, Start]:
     """Of each seed; empty where the cell begins with new weights.
 
@@ -48,8 +80,8 @@ def starts_of(cell: Cell, seeds: Sequence[int]) -> dict[int, Start]:
     """
     if not cell.config.start:
         return {}
-    path, _, disturbance = cell.config.start.partition("@")
-    if not user_path(path).is_dir():
+    path, disturbance = _place(cell.config.start)
+    if not path.is_dir():
         return starts_of_path(cell.config.start, tuple(seeds))
     directory = RunDirectory.open(path)
     return {seed: _start(directory, cell, seed, disturbance) for seed in seeds}

@@ -164,7 +164,7 @@ def _distinct(cells: Iterable[Cell]) -> list[Cell]:
         if not isinstance(cell, Cell):
             raise UserError(f"a study consists of rtd.Cell, not {type(cell).__name__}")
         key = tuple(cell.key.values())
-        if key in found and found[key] != cell:
+        if key in found and found[key].to_dict() != cell.to_dict():
             raise UserError(
                 f"two cells are both {', '.join(map(str, key))}: tables distinguish cells only by "
                 f"{', '.join(cell.key)}; put them in separate studies"

@@ -115,9 +115,11 @@ class Checkpoints:
         common = set.intersection(*(set(steps) for steps in found))
         if not common:
             if any(found):
+                starts = dict.fromkeys(job.start.about for job in jobs if job.start is not None)
                 warnings.warn(
-                    "lanes that now advance together have no checkpoint at a common step: "
-                    "they start from the beginning",
+                    "lanes that now advance together have no checkpoint at a common step: they "
+                    f"start from the beginning{', with the ' if starts else ''}"
+                    f"{' and the '.join(starts)}",
                     stacklevel=2,
                 )
             return None

@@ -33,7 +33,7 @@ def why_untrained(config: Config) -> str | None:
     if actor == 0 and "actor" not in config.frozen:
         if config.updates_before_the_actor:
             return (
-                f"actor_starts ({config.actor_starts:,}) allows no update of the actor within "
+                f"actor_starts ({config.first_actor_step:,}) allows no update of the actor within "
                 f"{config.total_steps:,} steps: lower actor_starts, or raise total_steps"
             )
         return (

@@ -21,7 +21,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rtd3jax.envs.compat.simulator import close_simulators
+from rtd3jax.envs.compat.simulated import fleet_of
+from rtd3jax.envs.compat.simulator_state import simulator_handles
 from rtd3jax.system.machine import cores
 from rtd3jax.system.program_cache import make_room, on_full
 from rtd3jax.training.checkpoint import Checkpoints
@@ -69,6 +70,7 @@ class Group:
         step: number of steps so far.
         returns: learning curves so far, [lanes, K], on the host: a device may be using ``state``.
         metrics: metrics of learning so far, [lanes, K, M], on the host.
+        simulators: handles of the lanes' simulators on the host; empty without simulators.
         lost: whether every lane has failed.
         error: the exception of a group that failed.
     """
@@ -79,6 +81,7 @@ class Group:
     step: int = 0
     returns: np.ndarray | None = None
     metrics: np.ndarray | None = None
+    simulators: list[int] = dataclasses.field(default_factory=list)
     lost: bool = False
     error: BaseException | None = None
 
@@ -178,20 +181,37 @@ def advance_groups(
         threading.Thread(target=_work, args=(pool, device, checkpoints), daemon=True)
         for device in (workers() if devices is None else devices)[: max(1, len(groups))]
     ]
-    for thread in threads:
-        thread.start()
     try:
-        for group in pool.events():
-            on_chunk(group)
+        with _simulators_of(groups):
+            for thread in threads:
+                thread.start()
+            try:
+                for group in pool.events():
+                    on_chunk(group)
+            finally:
+                pool.stop()
+                for thread in threads:
+                    thread.join()
     finally:
-        pool.stop()
-        for thread in threads:
-            thread.join()
-        close_simulators()
         if checkpoints is not None:
             for group in groups:
                 if group.state is not None and not group.finished:
                     checkpoints.save(group.lanes(), group, group.step)
+
+
+@contextlib.contextmanager
+def _simulators_of(groups: Sequence[Group]) -> Iterator[None]:
+    """Close the simulators of the groups at the end, but none of another training."""
+    fleets = [(group, fleet_of(group.jobs[0].program.env)) for group in groups]
+    with contextlib.ExitStack() as stack:
+        for played in {id(fleet): fleet for _, fleet in fleets if fleet is not None}.values():
+            stack.enter_context(played.in_use())
+        try:
+            yield
+        finally:
+            for group, fleet in fleets:
+                if fleet is not None:
+                    fleet.drop(group.simulators)
 
 
 class _Pool:
@@ -302,6 +322,7 @@ def _advanced(group: Group, state: LaneState, step: int) -> None:
     group.returns = np.atleast_2d(np.asarray(state.returns))
     metrics = np.asarray(state.metrics.curves)
     group.metrics = metrics if metrics.ndim == 3 else metrics[None]
+    group.simulators = simulator_handles(state.env_state)
     group.lost = bool(np.all(np.asarray(state.failure) != HEALTHY))
     group.state, group.step = state, step
 

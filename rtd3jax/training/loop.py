@@ -30,7 +30,8 @@ from rtd3jax.agents.replay import (
     store,
 )
 from rtd3jax.config import Config, traced_fields
-from rtd3jax.envs.compat.from_gymnasium import innermost, simulator_state, with_simulator
+from rtd3jax.envs.compat.simulated import innermost
+from rtd3jax.envs.compat.simulator_state import simulator_state, with_simulator
 from rtd3jax.envs.interface import action_bounds, foreign_code
 from rtd3jax.evaluation.rollout import episode_returns
 from rtd3jax.policies.trained import Policy

@@ -10,12 +10,9 @@ import jax
 import numpy as np
 
 from rtd3jax.config import Config
-from rtd3jax.envs.compat.from_gymnasium import (
-    is_simulated,
-    simulated_identity,
-    simulator_state,
-)
+from rtd3jax.envs.compat.simulated import is_simulated, simulated_identity
 from rtd3jax.envs.compat.simulator import fault_of
+from rtd3jax.envs.compat.simulator_state import simulator_state
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError

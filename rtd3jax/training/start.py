@@ -6,6 +6,7 @@ the new lane's own.
 """
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,10 @@ from rtd3jax.training.loop import HEALTHY, Lane, LaneState, Program
 KNOWN_OBSERVATIONS = 1_000
 """What a policy's statistics weigh, in observations, against those that the new lane will see."""
 
+_TAKEN = "learner", "statistics"
+"""Of a lane's checkpoint: the parts of a `LaneState` that training goes on from."""
+_FATE = ".failure", ".failed_at"
+
 
 @dataclasses.dataclass(frozen=True)
 class Start:
@@ -35,11 +40,14 @@ class Start:
         where: what it is, for people.
         policy: the trained policy, where that is all there is.
         checkpoint: the file of a lane that has more; None otherwise.
+        missing: why there is neither any more. A lane that is under way does not need its start,
+            unless its own checkpoints are lost.
     """
 
     where: str
     policy: Policy | None = None
     checkpoint: Path | None = None
+    missing: str | None = None
 
     @property
     def about(self) -> str:
@@ -53,6 +61,19 @@ class Start:
         Raises:
             UserError: when it is of another agent, of other sizes, or cannot be read.
         """
+        begun = self._begin(program, lane, state)
+        self.__dict__.pop("_read", None)  # it was taken over
+        return begun
+
+    def check(self, program: Program, lane: Lane) -> None:
+        """Raise as `begin` would, before anything is compiled; `begin` then reads nothing again."""
+        self._begin(program, lane, jax.eval_shape(program.init, lane))
+
+    def _begin(self, program: Program, lane: Lane, state: LaneState) -> LaneState:
+        if self.missing is not None:
+            raise UserError(
+                f"a lane that began from {self.where} cannot start over: {self.missing}"
+            )
         if self.checkpoint is not None:
             return self._whole(program, lane, state)
         policy = self.policy
@@ -67,10 +88,6 @@ class Start:
         parts = {name: jax.tree.map(jnp.array, policy.actor) for name in names}
         learner = dataclasses.replace(learner, **parts)
         return dataclasses.replace(state, learner=learner, statistics=statistics)
-
-    def check(self, program: Program, lane: Lane) -> None:
-        """Raise as `begin` would, before anything is compiled."""
-        self.begin(program, lane, jax.eval_shape(program.init, lane))
 
     def _check(self, program: Program, policy: Policy) -> None:
         config, sizes = program.config, (program.observation_size, program.action_size)
@@ -105,10 +122,19 @@ class Start:
                     f"{here[name]}: they must agree"
                 )
 
-    def _whole(self, program: Program, lane: Lane, state: LaneState) -> LaneState:
+    @functools.cached_property
+    def _read(self) -> tuple[dict[str, np.ndarray], Any]:
+        """What is gone on from, by its names in the checkpoint, without the replay; and its lane's
+        identity."""
         assert self.checkpoint is not None
         arrays, about = read_arrays(self.checkpoint)
-        identity = about.get("identity") if isinstance(about, dict) else None
+        places = tuple(f".{name}{mark}" for name in _TAKEN for mark in ".[")
+        kept = {n: array for n, array in arrays.items() if n.startswith(places) or n in _FATE}
+        return kept, about.get("identity") if isinstance(about, dict) else None
+
+    def _whole(self, program: Program, lane: Lane, state: LaneState) -> LaneState:
+        assert self.checkpoint is not None
+        arrays, identity = self._read
         if int(arrays.get(".failure", HEALTHY)) != HEALTHY:
             raise UserError(
                 f"{self.where} was lost in training, at step {int(arrays['.failed_at']):,}: no "
@@ -118,7 +144,7 @@ class Start:
         expected = jax.eval_shape(program.init, lane)
         found = {
             name: leaves_from_arrays(getattr(expected, name), arrays, f".{name}", self.checkpoint)
-            for name in ("learner", "statistics")
+            for name in _TAKEN
         }
         return dataclasses.replace(state, **found)
 

@@ -14,6 +14,7 @@ import rtd3jax as rtd
 from rtd3jax import report, sweep
 from rtd3jax.agents.learners.base import measured
 from rtd3jax.agents.networks import act, apply_network, init_network
+from rtd3jax.training.run import make_jobs
 
 TINY = dict(
     history_length=2,
@@ -100,6 +101,9 @@ def registered():
     actor = rtd.NetworkSpec(memory=("observation", "previous_action"), memory_has_current=True)
     critic = rtd.NetworkSpec(memory=("observation", "action"), memory_has_current=True)
     rtd.register_agent("rdpg", rtd.Variant(actor, critic, learner="ddpg"), replace=True)
+    reads = rtd.NetworkSpec(current=("observation",))
+    values = rtd.NetworkSpec(current=("observation", "action"))
+    rtd.register_agent("dpg", rtd.Variant(reads, values, learner="ddpg"), replace=True)
     rtd.register_agent(
         "tanh-td3", rtd.Variant(actor, critic, encoder=TanhEncoder, colour="#123456"), replace=True
     )
@@ -145,6 +149,29 @@ def test_what_was_added_trains_saves_loads_and_leaves(tmp_path, agent, memory):
         np.testing.assert_allclose(played[0], action, atol=1e-5)
         for player in players:
             np.testing.assert_allclose(player.step(observation), action, atol=1e-5)
+
+
+def test_the_actor_of_an_added_learner_waits_as_long_as_it_is_told():
+    env = rtd.make("rover", "ar1-slip")
+    config = rtd.Config(algorithm="dpg", **{**TINY, "history_length": None, "actor_starts": 40})
+    (job,) = make_jobs(env, config, [0])
+    agent, keys = job.program.agent, jax.random.split(jax.random.key(0), 4)
+    numbers = job.lane.hyperparameters
+    batch = agent.sample(agent.empty_replay(), keys[0], jnp.int32(20), numbers.history_length, None)
+    update = jax.jit(agent.update)
+    states = [jax.jit(agent.init)(keys[1])]
+    for count in range(1, 22):
+        states.append(update(states[-1], batch, keys[2:], numbers, jnp.int32(count))[0])
+
+    def moved(part):
+        """The updates that moved it."""
+        leaves = [jax.tree.leaves(getattr(state, part)) for state in states]
+        pairs = zip(leaves, leaves[1:], strict=False)
+        same = (all(map(np.array_equal, one, other)) for one, other in pairs)
+        return [count for count, still in enumerate(same, start=1) if not still]
+
+    # Updates begin at step 20: the twenty-first is that of step 40.
+    assert moved("actor") == [21] and moved("critic") == list(range(1, 22))
 
 
 def test_a_seventh_agent_sweeps_draws_reports_and_loads(tmp_path):

@@ -1,6 +1,7 @@
 """Fits processes to simulated logs with known parameters."""
 
 import math
+import tracemalloc
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ import rtd3jax as rtd
 from rtd3jax.envs.rover import Rover, RoverParams
 from rtd3jax.envs.rover.slip import Ar1Slip, SineSlip
 from rtd3jax.errors import UserError
+from rtd3jax.identification import sine
 from rtd3jax.identification.picture import autocorrelation, played, spectrum
 
 STEPS = 150
@@ -96,6 +98,38 @@ def test_waves_are_found():
     alone = [rtd.fit_process(log[:1, :, :1], "sine", max_slip=1.0) for log in logs]
     for name, share in shares(alone, truth).items():
         assert 0.90 <= share <= 1.0, (name, share)
+
+
+@pytest.mark.parametrize("rows", [8, 9, 97, 150])
+def test_the_profile_over_the_period_against_each_periods_own_least_squares(rows):
+    time = np.arange(rows)
+    wave = 0.3 + 0.2 * np.sin(0.2 * time) + 0.02 * np.random.default_rng(rows).normal(size=rows)
+    angles, coefficients, explained = sine._profile(wave)
+    periods = rows / np.arange(0.5, rows / 3.0, 0.125)
+    np.testing.assert_allclose(angles, 2.0 * np.pi / periods)
+    away = wave - wave.mean()
+    for angle, found, square in zip(angles, coefficients, explained, strict=True):
+        turns = np.outer(time, angle)
+        line = np.hstack((np.sin(turns), np.cos(turns), np.ones_like(turns)))
+        own, *_ = np.linalg.lstsq(line, away)
+        # The ridge of the profile moves a coefficient by a billionth of it.
+        np.testing.assert_allclose(found, own, rtol=1e-7, atol=1e-8)
+        assert square == pytest.approx(away @ line @ own, rel=1e-7, abs=1e-12)
+
+
+def test_a_long_log_takes_memory_like_its_rows():
+    rows, period = 100_000, 37.3
+    noise = 0.02 * np.random.default_rng(0).standard_normal(rows)
+    slip = 0.5 + 0.2 * np.sin(2.0 * np.pi * np.arange(rows) / period) + noise
+    tracemalloc.start()
+    try:
+        fit = rtd.fit_process(slip, "sine", max_slip=1.0)
+        most = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert most < 2**28, most
+    value, error = fit.estimates["period"]
+    assert abs(value - period) < 4.0 * error < 1e-3
 
 
 def test_clipped_waves_and_the_ranges_they_are_drawn_from():

@@ -182,6 +182,13 @@ def test_more_steps_that_cannot_go_on_are_refused_with_what_to_do(tmp_path):
     assert later.lanes.is_done(cell(total_steps=90), 0)  # it would be lost again
 
 
+def test_a_default_that_is_given_adds_nothing(tmp_path):
+    there = RunDirectory(tmp_path / "run", [cell()], [0], 2)
+    asked = cell(actor_starts=SETTINGS["learning_starts"])
+    again = RunDirectory(tmp_path / "run", [asked], [0], 2, prepare=False)
+    assert again.plan() == "" and again.cells == there.cells == [cell()]
+
+
 def test_looking_at_a_study_does_not_let_it_grow(tmp_path):
     _directory(tmp_path)
     before = (tmp_path / "config.json").read_bytes()

@@ -5,10 +5,13 @@ import subprocess
 import sys
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import rtd3jax as rtd
+from rtd3jax.envs.interface import foreign_code
+from rtd3jax.training.run import make_jobs
 
 WORKING = [
     *("JAX_DEBUG_NANS=1", "JAX_DEBUG_INFS=1", "JAX_ENABLE_X64=1", "JAX_CHECK_TRACER_LEAKS=1"),
@@ -60,6 +63,41 @@ def with_switch(switch, code, *arguments):
 def test_everything_works_under_it(switch, tmp_path):
     done = with_switch(switch, EVERYTHING, tmp_path / "run")
     assert done.returncode == 0, done.stderr[-2000:]
+
+
+def wide(tree):
+    """Floats of more than 32 bits in it."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return [jax.tree_util.keystr(path) for path, leaf in leaves if leaf.dtype == np.float64]
+
+
+@pytest.mark.parametrize("env_id", rtd.ENVIRONMENTS)
+def test_environments_stay_in_single_precision_where_double_is_allowed(env_id):
+    with jax.enable_x64(True):
+        for disturbance in rtd.DISTURBANCES[env_id]:
+            env = rtd.make(env_id, disturbance)
+            params, action = env.default_params, jnp.zeros(env.num_actions, jnp.float32)
+            with foreign_code():
+                first, state = jax.eval_shape(env.reset, jax.random.key(0), params)
+                seen, after, reward, *_ = jax.eval_shape(
+                    env.step, jax.random.key(0), state, action, params
+                )
+            assert wide((first, state, seen, after, reward)) == [], disturbance
+            types = [[leaf.dtype for leaf in jax.tree.leaves(s)] for s in (state, after)]
+            assert types[0] == types[1], disturbance
+
+
+@pytest.mark.parametrize("algorithm", rtd.ALGORITHMS)
+def test_agents_are_trained_in_single_precision_where_double_is_allowed(algorithm):
+    length = None if algorithm == "td3" else 2
+    tiny = dict(total_steps=40, hidden_size=4, batch_size=4, learning_starts=10, eval_every=20)
+    config = rtd.Config(algorithm, length, eval_episodes=1, normalise_observations=True, **tiny)
+    with jax.enable_x64(True):
+        (job,) = make_jobs(rtd.make("pendulum", "random-sine"), config, [0])
+        step = jax.ShapeDtypeStruct((), jnp.int32)
+        state = jax.eval_shape(job.program.init, job.lane)
+        after = jax.eval_shape(job.program.advance, job.lane, state, step, step)
+    assert wide(state) == wide(after) == []
 
 
 def test_a_platform_that_is_not_there_is_named_with_the_remedy():

@@ -14,9 +14,11 @@ from rtd3jax import sweep
 from rtd3jax.agents.freeze import frozen_parts
 from rtd3jax.study import finish, references
 from rtd3jax.study.derive import derive
+from rtd3jax.study.execute import checkpoints_of
 from rtd3jax.study.rundir import RunDirectory
-from rtd3jax.study.starts import starts_of
+from rtd3jax.study.starts import add_starts, starts_of
 from rtd3jax.system.files import read_arrays, write_arrays
+from rtd3jax.training import lanes
 from rtd3jax.training.run import make_jobs
 from rtd3jax.training.start import KNOWN_OBSERVATIONS, starts_of_path
 
@@ -156,13 +158,27 @@ def test_each_seed_goes_on_from_its_own_and_with_others_the_same(env, kept):
 def test_what_does_not_fit_is_refused_before_compilation(
     env, kept, monkeypatch, of, changes, message
 ):
-    from rtd3jax.training import lanes
-
     run, directory = kept
     monkeypatch.setattr(lanes, "_chunk", lambda *_: pytest.fail("compiled"))
     start = run.policy(0) if of == "policy" else directory
     with pytest.raises(rtd.UserError, match=message):
         rtd.train(env, _config(**changes), [0], progress=False, start=start)
+
+
+def test_a_checkpoint_is_read_once_and_let_go(env, kept, monkeypatch):
+    from rtd3jax.training import start as module
+
+    _, directory = kept
+    read = []
+    monkeypatch.setattr(module, "read_arrays", lambda f: read.append(f) or read_arrays(f))
+    start = starts_of_path(directory, (1,))[1]
+    (job,) = make_jobs(env, _config(start="there"), [1], starts={1: start})
+    start.check(job.program, job.lane)
+    (held, _), (arrays, _) = start._read, read_arrays(start.checkpoint)
+    assert ".learner.critic_optimizer.count" in held and set(held) < set(arrays)
+    assert not any("replay" in name for name in held)  # it may be large
+    start.begin(job.program, job.lane, jax.eval_shape(job.program.init, job.lane))
+    assert read == [start.checkpoint] and "_read" not in vars(start)
 
 
 def test_a_lost_lane_is_no_start(env, kept, tmp_path):
@@ -196,6 +212,42 @@ def test_what_is_no_start_is_refused(env, kept, tmp_path):
     config = _config(normalise_observations=False)
     with pytest.raises(rtd.UserError, match="2 observation and 2 action elements.*has 3 and 1"):
         rtd.train(pendulum, config, [0], progress=False, start=policy)
+
+
+def test_side_by_side_lanes_whose_checkpoints_are_of_no_use_begin_from_the_start_again(
+    env, kept, tmp_path
+):
+    run, _ = kept
+    file = tmp_path / "p.safetensors"
+    run.policy(0).save(file)
+    cell = rtd.Cell("rover", "sine-slip", _config(start=str(file)))
+    directory = RunDirectory(tmp_path / "run", [cell], [0, 1], 2)
+    checkpoints = checkpoints_of(directory, (None, None))
+    jobs = directory.jobs("vmap")
+    program = jobs[0].program
+    states = jax.jit(jax.vmap(program.init))(lanes.stacked([job.lane for job in jobs], None))
+    for job, group_step in zip(jobs, (20, 40), strict=True):
+        (state,) = (s for j, s in lanes.Group(jobs, state=states).lanes() if j is job)
+        checkpoints.save([(job, state)], job, group_step)
+        # The newest of both is of step 60, and the first lane's is cut short.
+        checkpoints.save([(job, state)], job, 60)
+    newest = directory.lanes.checkpoint_directory(cell, 0) / "step-000000060.safetensors"
+    newest.write_bytes(newest.read_bytes()[:1000])
+    add_starts(directory, jobs, write=True)
+    assert not directory.lanes.start_path(cell, 0).exists()  # it stands there since they began
+    (group,) = lanes.make_groups(jobs, "vmap", 1, checkpoints=checkpoints)
+    with pytest.warns(UserWarning, match=f"from the beginning, with the actor of {file}"):
+        lanes._restore(group, checkpoints)
+    begun = lanes._with_start(group, states)
+    for index in range(2):
+        actor = jax.tree.map(lambda leaf, i=index: leaf[i], begun.learner.actor)
+        assert _same(actor, run.policy(0).actor)
+    # One that is under way does not need its start, but cannot start over without it.
+    file.unlink()
+    jobs = directory.jobs("vmap")
+    add_starts(directory, jobs, write=True)
+    with pytest.raises(rtd.UserError, match=f"began from {file} cannot start over: .* be read"):
+        lanes._with_start(lanes.Group(jobs), states)
 
 
 FLAGS = [
@@ -237,3 +289,29 @@ def test_a_sweep_goes_on_from_another_and_says_so(tmp_path, monkeypatch, capsys)
     # What is done needs its beginning no more.
     shutil.rmtree(tmp_path / "first")
     assert sweep.main([*begun, "--out", second, "--freeze", "actor.current"]) == 0
+
+
+def test_what_fresh_moves_away_is_no_start(tmp_path, capsys):
+    def command(disturbance, out, start):
+        study = ["--disturbances", disturbance, "--seeds", "1", "--out", str(tmp_path / out)]
+        return [*FLAGS, *study, "--fresh", "--start", str(start)]
+
+    config = rtd.Config(**{**SMALL, "start": "elsewhere"})
+    own, other = (
+        RunDirectory(tmp_path / name, [rtd.Cell("rover", "ar1-slip", config)], [0], 2)
+        for name in ("own", "other")
+    )
+    (tmp_path / "link").symlink_to(own.path)
+    for start in (own.path, f"{own.path}@ar1-slip", own.path / "policy", tmp_path / "link"):
+        assert sweep.main(command("ar1-slip", "own", start)) == 2
+        error = capsys.readouterr().err
+        assert f"--start {start} lies in {own.path}, which --fresh moves" in error
+        assert error.count("\n") == 1
+    # What is done there now is to be trained again: its start is looked at before anything moves.
+    (cell,) = own.cells
+    own.lanes.write_error(cell, 0, "makes the folder")
+    own.lanes.lane_path(cell, 0).touch()
+    assert own.lanes.is_done(cell, 0)
+    assert sweep.main(command("ar1-slip", "own", f"{other.path}@none")) == 2
+    assert "has no td3 under none to begin from" in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "other", "own"]

@@ -49,7 +49,11 @@ class Learner(Protocol):
         stay finite, or the lane is lost."""
 
     def init(self, key: jax.Array, networks: Networks) -> Any:
-        """The initial state: a pytree of arrays whose field ``actor`` holds the actor."""
+        """The initial state: a dataclass of arrays whose field ``actor`` holds the actor.
+
+        ``freeze`` and ``actor_starts`` of `rtd3jax.Config` find the parts of it by name: ``actor``
+        and ``critics``; ``target_actor`` and ``actor_optimizer`` start with the actor.
+        """
 
     def update(
         self,

@@ -54,11 +54,9 @@ class TD3:
 
     Attributes:
         policy_delay: critic updates per update of the actor and the targets.
-        waits: critic updates before the first actor update; the target critics are updated too.
     """
 
     policy_delay: int = 2
-    waits: int = 0
 
     metrics = (
         "critic_loss",
@@ -104,37 +102,18 @@ class TD3:
         state, critic = update_critics(networks, state, batch, keys[0], hyperparameters, norms)
         state, actor = lax.cond(
             count % self.policy_delay == 0,
-            lambda before: self._delayed(
-                before,
-                update_actor_and_targets(networks, before, batch, keys[1], hyperparameters, norms),
-                count,
+            lambda before: update_actor_and_targets(
+                networks, before, batch, keys[1], hyperparameters, norms
             ),
             lambda before: (before, {name: not_measured() for name in ACTOR_METRICS}),
             state,
         )
         return state, critic | actor
 
-    def _delayed(
-        self, before: TD3State, after: tuple[TD3State, Metrics], count: jax.Array
-    ) -> tuple[TD3State, Metrics]:
-        """``after``, in which the actor keeps its values ``before`` until its first update."""
-        if not self.waits:
-            return after
-        state, metrics = after
-        kept = {
-            name: jax.tree.map(
-                lambda new, old: jnp.where(count > self.waits, new, old),
-                getattr(state, name),
-                getattr(before, name),
-            )
-            for name in ("actor", "target_actor", "actor_optimizer")
-        }
-        return dataclasses.replace(state, **kept), metrics
-
 
 def make_td3(config: Config) -> TD3:
     """The learner of a configuration."""
-    return TD3(config.policy_delay, config.updates_before_the_actor)
+    return TD3(config.policy_delay)
 
 
 def target(

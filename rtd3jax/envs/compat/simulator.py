@@ -9,13 +9,16 @@ import atexit
 import contextlib
 import hashlib
 import itertools
+import math
 import queue
+import struct
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
+from jax.typing import ArrayLike
 
 from rtd3jax.errors import UserError, first_line
 
@@ -89,7 +92,7 @@ class Simulator:
             self._env = self._call("the factory", self._make)
         answer = self._call("reset", lambda: self._env.reset(seed=seed))
         if not isinstance(answer, tuple) or len(answer) != 2:
-            raise self._wrong("reset must return (observation, info)")
+            raise self.failed("reset must return (observation, info)")
         observation = self._observation("reset", answer[0])
         self.place = seed, 0, _digest(SEED_DIGEST, observation, 0.0)
         return observation
@@ -104,17 +107,17 @@ class Simulator:
         answer = self._call("step", lambda: self._env.step(action))
         count = len(answer) if isinstance(answer, tuple) else 1
         if count != 5:
-            raise self._wrong(
+            raise self.failed(
                 f"step returned {count} values; it must return (observation, reward, terminated, "
                 "truncated, info)"
             )
         observation = self._observation("step", answer[0])
         try:
-            reward = float(np.asarray(answer[1], np.float64).reshape(()))
+            reward = float(answer[1]) if isinstance(answer[1], float) else _number(answer[1])
         except (TypeError, ValueError):
-            raise self._wrong(f"the reward {answer[1]!r} is not a number") from None
-        if not np.isfinite(reward):
-            raise self._wrong(f"the reward is {reward}")
+            raise self.failed(f"the reward {answer[1]!r} is not a number") from None
+        if not math.isfinite(reward):
+            raise self.failed(f"the reward is {reward}")
         self.place = seed, time + 1, _digest(digest, observation, reward)
         return observation, reward, bool(answer[2]), bool(answer[3])
 
@@ -129,41 +132,46 @@ class Simulator:
                 self._thread.do(self._env.close, min(_CLOSING_SECONDS, self._seconds))
         self._thread.end()
 
+    def failed(self, message: str) -> Fault:
+        """What is to be raised of it now, and whenever it is asked again."""
+        self.fault = f"the simulator failed: {message}"
+        return Fault(self.fault)
+
     def _call(self, what: str, call: Callable[[], Any]) -> Any:
         if self.fault is not None:
             raise Fault(self.fault)
         try:
             return self._thread.do(call, self._seconds)
         except TimeoutError:
-            raise self._wrong(
+            raise self.failed(
                 f"{what} did not return within {self._seconds:g} s (step_seconds=...)"
             ) from None
         except UserError as error:
-            raise self._wrong(str(error)) from error
+            raise self.failed(str(error)) from error
         except BaseException as error:
             message = f"{type(error).__name__}: {first_line(error)}"
-            raise self._wrong(f"{what} raised {message}") from error
+            raise self.failed(f"{what} raised {message}") from error
 
     def _observation(self, what: str, observation: object) -> np.ndarray:
         try:
             flat = self._read(observation)
         except (TypeError, ValueError, KeyError, IndexError) as error:
-            raise self._wrong(f"the observation of {what} is unfit: {first_line(error)}") from None
+            raise self.failed(f"the observation of {what} is unfit: {first_line(error)}") from None
         if not np.isfinite(flat).all():
             where = int(np.argmin(np.isfinite(flat)))
-            raise self._wrong(f"element {where} of the observation of {what} is {flat[where]}")
+            raise self.failed(f"element {where} of the observation of {what} is {flat[where]}")
         return flat
 
-    def _wrong(self, message: str) -> Fault:
-        self.fault = f"the simulator failed: {message}"
-        return Fault(self.fault)
+
+def _number(reward: ArrayLike) -> float:
+    """A reward of any numeric type, also as an array of one element."""
+    return float(np.asarray(reward, np.float64).reshape(()))
 
 
-def _digest(before: Sequence[int], observation: np.ndarray, reward: float) -> tuple[int, int]:
-    text = np.asarray(before, np.uint32).tobytes() + observation.tobytes()
-    code = hashlib.blake2b(text + np.float64(reward).tobytes(), digest_size=8).digest()
-    first, second = np.frombuffer(code, np.uint32)
-    return int(first), int(second)
+def _digest(before: tuple[int, int], observation: np.ndarray, reward: float) -> tuple[int, int]:
+    text = struct.pack("=2I", *before) + observation.tobytes() + struct.pack("=d", reward)
+    first, second = struct.unpack("=2I", hashlib.blake2b(text, digest_size=8).digest())
+    return first, second
 
 
 @contextlib.contextmanager
@@ -191,6 +199,7 @@ class Fleet:
         self._lock = threading.Lock()
         self._busy: dict[int, Simulator] = {}
         self._free: list[Simulator] = []
+        self._users = 0
         _fleets.append(self)
 
     def reset(self, handle: int, seed: int) -> tuple[int, np.ndarray, tuple[int, int]]:
@@ -237,6 +246,37 @@ class Fleet:
             if simulator is not None and simulator.fault is None:
                 del self._busy[handle]
                 self._free.append(simulator)
+
+    @contextlib.contextmanager
+    def in_use(self) -> Iterator[None]:
+        """While anyone is within, free simulators stay open for further episodes.
+
+        Then they are closed, and those that failed, which are of no use to anyone. Others that are
+        busy stay open: they may be another's.
+        """
+        with self._lock:
+            self._users += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._users -= 1
+                idle: list[Simulator] = []
+                if not self._users:
+                    idle = [s for s in self._busy.values() if s.fault is not None]
+                    idle, self._free = [*idle, *self._free], []
+            for simulator in idle:
+                simulator.close()
+
+    def drop(self, handles: Iterable[int]) -> None:
+        """Close these; one that failed keeps its fault, for whoever asks what became of it."""
+        with self._lock:
+            own = {handle: self._busy[handle] for handle in handles if handle in self._busy}
+            for handle, simulator in own.items():
+                if simulator.fault is None:
+                    del self._busy[handle]
+        for simulator in own.values():
+            simulator.close()
 
     def close(self) -> None:
         """Close all; a place that is asked for later is replayed."""

@@ -5,25 +5,56 @@ episode has 200 steps and never terminates.
 The observation [3] is (cos theta, sin theta, theta dot).
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from gymnax.environments.classic_control import pendulum
 from gymnax.environments.classic_control.pendulum import EnvParams as PendulumParams
 from gymnax.environments.classic_control.pendulum import EnvState as PendulumState
+from jax.typing import ArrayLike
 
-from rtd3jax.envs.identity import ValueIdentity, strong
+from rtd3jax.envs.identity import ValueIdentity
+from rtd3jax.envs.pendulum.scene import PendulumScene
 from rtd3jax.envs.processes.process import float32
 
 __all__ = ["Pendulum", "PendulumParams", "PendulumState"]
 
 
 class Pendulum(ValueIdentity, pendulum.Pendulum):
-    """gymnax's dynamics and reward, unchanged."""
+    """gymnax's dynamics and reward, unchanged, in float32 also under JAX_ENABLE_X64.
+
+    gymnax's own would begin in float64 there and go on in float32, which no loop takes.
+    """
 
     def reset_env(self, key: jax.Array, params: PendulumParams) -> tuple[jax.Array, PendulumState]:
         """Draw the start: theta from U(-pi, pi), theta dot from U(-1, 1)."""
-        observation, state = super().reset_env(key, params)
-        return observation, strong(state)
+        high = jnp.array([jnp.pi, 1.0], jnp.float32)
+        theta, theta_dot = jax.random.uniform(key, (2,), jnp.float32, -high, high)
+        state = PendulumState(
+            time=jnp.int32(0), last_u=jnp.float32(0.0), theta=theta, theta_dot=theta_dot
+        )
+        return self.get_obs(state), state
+
+    def step_env(
+        self, key: jax.Array, state: PendulumState, action: ArrayLike, params: PendulumParams
+    ) -> tuple[jax.Array, PendulumState, jax.Array, jax.Array, dict[Any, Any]]:
+        """One step under ``action`` [1]."""
+        action = jnp.asarray(action, jnp.float32)
+        observation, after, reward, terminated, info = super().step_env(key, state, action, params)
+        evolved = PendulumState(
+            time=jnp.asarray(after.time, jnp.int32),
+            last_u=after.last_u.astype(jnp.float32),
+            theta=after.theta.astype(jnp.float32),
+            theta_dot=after.theta_dot.astype(jnp.float32),
+        )
+        return (
+            observation.astype(jnp.float32),
+            evolved,
+            reward.astype(jnp.float32),
+            terminated,
+            info,
+        )
 
     def observed_reward(
         self, observation: jax.Array, action: jax.Array, params: PendulumParams
@@ -37,3 +68,7 @@ class Pendulum(ValueIdentity, pendulum.Pendulum):
         limit = float32(params.max_torque)
         torque = jnp.clip(jnp.asarray(action, jnp.float32).reshape(()), -limit, limit)
         return -(theta**2 + 0.1 * observation[2] ** 2 + 0.001 * torque**2)
+
+    def scene(self, params: PendulumParams) -> PendulumScene:
+        """The drawing for the frames of an episode."""
+        return PendulumScene(params)

@@ -14,6 +14,7 @@ from jax.typing import ArrayLike
 
 from rtd3jax.envs.identity import ValueIdentity, strong
 from rtd3jax.envs.processes.process import NoDisturbance, Process, float32
+from rtd3jax.envs.rover.scene import RoverScene
 from rtd3jax.envs.rover.slip import WHEELS
 
 
@@ -94,6 +95,10 @@ class Rover(ValueIdentity, environment.Environment):
     def is_terminated(self, state: RoverState, params: RoverParams) -> jax.Array:
         """Always false: only the time limit ends an episode."""
         return jnp.zeros((), jnp.bool_)
+
+    def scene(self, params: RoverParams) -> RoverScene:
+        """The drawing for the frames of an episode."""
+        return RoverScene(params)
 
     @property
     def name(self) -> str:

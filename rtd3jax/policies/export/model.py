@@ -29,6 +29,7 @@ from jax.typing import ArrayLike
 from rtd3jax.agents.memory.base import Params
 from rtd3jax.agents.networks import Linear, Network
 from rtd3jax.agents.normalise import LIMIT, Normaliser
+from rtd3jax.config import Acting
 from rtd3jax.errors import UserError
 
 GATES = "ifog"
@@ -69,7 +70,7 @@ class Model:
     cell: str | None
     network: Network
     params: Params
-    acting: str = "window"
+    acting: Acting = "window"
 
     @property
     def runs_on(self) -> bool:

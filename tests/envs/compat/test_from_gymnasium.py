@@ -175,10 +175,12 @@ def test_a_simulator_that_fails_says_how_and_stays_lost(fault, message):
 def test_other_lanes_go_on():
     number = itertools.count()
 
-    def some():  # the first is made to be looked at, the second is the first lane's
-        return Cart(fault="raise" if next(number) == 1 else None, at=25)
+    def some():  # to be looked at, another's, the first lane's, ...
+        return Cart(fault="raise" if next(number) == 2 else None, at=25)
 
     env = rtd.from_gymnasium(some, keep=[0], max_steps_in_episode=12)
+    _, held = env.reset(jax.random.key(0), env.default_params)
+    closed = Cart.closed
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         run = rtd.train(env, SMALL, seeds=range(2), progress=False)
@@ -186,6 +188,23 @@ def test_other_lanes_go_on():
     assert "step raised RuntimeError: the wheel broke" in run.failures[0].reason
     healthy = 1 - run.failures[0].seed
     assert np.isfinite(run.returns[healthy]).all()
+    # What someone else plays stays open and where it is; all else is closed.
+    assert env.fleet.count == 1 and not env.fleet._busy[int(held.handle)]._closed
+    assert Cart.closed - closed == next(number) - 2
+    close_simulators()
+
+
+def test_a_free_simulator_stays_open_while_anyone_plays():
+    fleet = environment().fleet
+    first, second = (fleet.reset(-1, seed)[0] for seed in (1, 2))
+    with fleet.in_use():
+        with fleet.in_use():
+            fleet.release(first)
+        assert fleet.count == 2 and fleet.reset(-1, 3)[0] != first
+        fleet.release(first + 2)
+        fleet.drop([second])
+        assert fleet.count == 1
+    assert fleet.count == 0
 
 
 @pytest.mark.parametrize("noise", [False, pytest.param(True, marks=pytest.mark.slow)])
@@ -280,6 +299,31 @@ def test_a_longer_time_limit_than_the_ids_own():
             jax.random.key(1), state, jnp.zeros(1), env.default_params
         )
         assert bool(truncated) == (number == 209)
+    close_simulators()
+
+
+def test_an_episode_longer_than_the_log_of_actions_is_refused():
+    env = rtd.from_gymnasium("Pendulum-v1", max_steps_in_episode=3)
+    longer = env.default_params.replace(max_steps_in_episode=4)
+    policy = rtd.constant_policy([0.5])
+    disturbed = rtd.disturb(env, rtd.Delay())
+    for made, params in (
+        (env, longer),
+        (disturbed, disturbed.default_params.replace(env=longer)),
+    ):
+        with pytest.raises(rtd.UserError, match="=4 is beyond the 3 steps with .* a larger max_"):
+            rtd.evaluate(policy, made, 1, params=params)
+    shorter = env.default_params.replace(max_steps_in_episode=2)
+    assert rtd.rollout(policy, env, 1, params=shorter).lengths[0] == 2
+    # Where the parameters are traced the simulator itself refuses.
+    _, state = env.reset(jax.random.key(0), longer)
+    step = jax.jit(env.step_env)
+    with pytest.warns(UserWarning, match="its episode goes on beyond the 3 steps"):
+        for _ in range(4):
+            observation, state, *_ = jax.block_until_ready(
+                step(jax.random.key(1), state, jnp.zeros(1), longer)
+            )
+    assert np.isnan(observation).all() and "3 steps" in env.fleet.fault(int(state.handle))
     close_simulators()
 
 

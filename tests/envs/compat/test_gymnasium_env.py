@@ -232,6 +232,30 @@ def test_what_has_no_drawing_shows_its_signals():
     assert env.render().shape == (360, 640, 3)
 
 
+class Fall:
+    """The scene of a point: a bar as high as what was last seen of it."""
+
+    def __init__(self, params):
+        self.drawn = []
+
+    def first(self, state):
+        return np.array([float(jnp.ravel(jax.tree.leaves(state)[0])[0])])
+
+    def draw(self, axes, observations, actions):
+        self.drawn.append((len(observations), len(actions)))
+        axes.axhspan(0.0, 1.0, color="#ff0000")
+
+
+def test_an_environment_with_a_scene_is_drawn_by_it(monkeypatch):
+    monkeypatch.setattr(Falling, "scene", lambda self, params: Fall(params), raising=False)
+    env = rtd.to_gymnasium(Falling(), render_mode="rgb_array")
+    env.reset(seed=0)
+    env.step(np.ones(1))
+    left = env.render()[:, :300]
+    assert np.all(left == (255, 0, 0), axis=-1).mean() > 0.5
+    assert env._episode._scene.drawn == [(2, 1)]
+
+
 def test_the_pendulum_stands_where_its_angle_says():
     env = rtd.to_gymnasium(rtd.make("pendulum"))
     episode = Episode(env.environment, env.params)

@@ -1,0 +1,93 @@
+"""Calls from a compiled program to a function on the host."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import io_callback
+from jax.experimental.buffer_callback import Buffer, buffer_callback
+from jax.typing import ArrayLike
+
+
+def host_call(
+    host: Callable[..., tuple],
+    shapes: tuple[tuple[tuple[int, ...], Any], ...],
+    due: Callable[[jax.Array], jax.Array] | None,
+    *arguments: jax.Array,
+) -> tuple[jax.Array, ...]:
+    """The host's answers; side by side, one call asks for all of them, in their order.
+
+    With ``due``, of the first argument, the host is called where it is true; else zeros.
+    """
+    arguments = tuple(map(jnp.asarray, arguments))
+    ranks = [argument.ndim for argument in arguments]
+    dtypes = [argument.dtype for argument in arguments]
+
+    def on_host(*arrays: np.ndarray) -> tuple[ArrayLike, ...]:
+        lead = arrays[0].shape[: arrays[0].ndim - ranks[0]]
+        if not lead:
+            return host(*arrays)
+        flat = [a.reshape(-1, *a.shape[len(lead) :]) for a in arrays]
+        answers = [host(*row) for row in zip(*flat, strict=True)]
+        columns = zip(*answers, strict=True)
+        return tuple(
+            np.stack(column).reshape(*lead, *shape).astype(dtype)
+            for column, (shape, dtype) in zip(columns, shapes, strict=True)
+        )
+
+    @jax.custom_batching.custom_vmap
+    def call(*given: jax.Array) -> tuple[jax.Array, ...]:
+        lead = given[0].shape[: given[0].ndim - ranks[0]]
+        results = tuple(jax.ShapeDtypeStruct((*lead, *shape), dtype) for shape, dtype in shapes)
+
+        def ask(*given: jax.Array) -> tuple[jax.Array, ...]:
+            return _ask(on_host, results, *given)
+
+        if due is None:
+            return ask(*given)
+
+        def skip(*given: jax.Array) -> tuple[jax.Array, ...]:
+            return tuple(jnp.zeros(result.shape, result.dtype) for result in results)
+
+        return jax.lax.cond(due(given[0]), ask, skip, *given)
+
+    @call.def_vmap
+    def _side_by_side(size: int, batched: list[bool], *given: jax.Array) -> tuple:
+        wide = []
+        for array, dtype, is_batched in zip(given, dtypes, batched, strict=True):
+            known = jnp.asarray(array, dtype)  # a constant may come as a Python number
+            wide.append(known if is_batched else jnp.broadcast_to(known, (size, *known.shape)))
+        return call(*wide), tuple(True for _ in shapes)
+
+    return call(*arguments)
+
+
+def _ask(
+    on_host: Callable[..., tuple[ArrayLike, ...]],
+    results: tuple[jax.ShapeDtypeStruct, ...],
+    *given: jax.Array,
+) -> tuple[jax.Array, ...]:
+    """One call of ``on_host``, whose arguments are arrays that it must not keep.
+
+    A CPU's own memory is read and written in place: `io_callback` makes a device's array of every
+    argument first, which takes twenty times as long as the rest of the call.
+    """
+
+    def in_place(context: object, out: Sequence[Buffer], *given: Buffer) -> None:
+        answers = on_host(*map(np.asarray, given))
+        for buffer, answer in zip(out, answers, strict=True):
+            np.asarray(buffer)[...] = answer
+
+    def copied(*given: jax.Array) -> tuple[np.ndarray, ...]:
+        answers = zip(on_host(*map(np.asarray, given)), results, strict=True)
+        return tuple(np.asarray(answer, result.dtype) for answer, result in answers)
+
+    def on_cpu(*given: jax.Array) -> tuple[jax.Array, ...]:
+        return tuple(buffer_callback(in_place, results, has_side_effect=True)(*given))
+
+    def elsewhere(*given: jax.Array) -> tuple[jax.Array, ...]:
+        return tuple(io_callback(copied, results, *given))
+
+    return jax.lax.platform_dependent(*given, cpu=on_cpu, default=elsewhere)

@@ -1,0 +1,51 @@
+"""What the rest of the package asks of an environment that a simulator on the host may play."""
+
+import jax
+import numpy as np
+from jax.experimental import io_callback
+
+from rtd3jax.envs.compat.simulated_environment import FromGymnasium
+from rtd3jax.envs.compat.simulator import Fleet
+from rtd3jax.envs.compat.simulator_state import SimulatorState
+
+
+def innermost(env: object) -> object:
+    """The environment below all disturbances."""
+    while hasattr(env, "base"):
+        env = env.base
+    return env
+
+
+def fleet_of(env: object) -> Fleet | None:
+    """The simulators of the environment, disturbed or not; None where it has none."""
+    base = innermost(env)
+    return base.fleet if isinstance(base, FromGymnasium) else None
+
+
+def is_simulated(env: object) -> bool:
+    """Whether a simulator on the host plays the environment, disturbed or not."""
+    return isinstance(innermost(env), FromGymnasium)
+
+
+def simulated_identity(env: object) -> str:
+    """What a simulator's environment was made of, as checkpoints have it."""
+    base = innermost(env)
+    assert isinstance(base, FromGymnasium)
+    made, kwargs, keep, limit, _ = base.identity()
+    name = made if isinstance(made, str) else base.name
+    return f"{name} keep={keep} limit={limit} {kwargs}".strip()
+
+
+def release(env: object, env_state: object) -> None:
+    """Within a program: the simulators of a state, or of several, are free for other episodes."""
+    states = jax.tree.leaves(env_state, is_leaf=lambda part: isinstance(part, SimulatorState))
+    base = innermost(env)
+    for state in states:
+        if isinstance(state, SimulatorState) and isinstance(base, FromGymnasium):
+            fleet = base.fleet
+
+            def free(handles: jax.Array, fleet: Fleet = fleet) -> None:
+                for handle in np.asarray(handles).reshape(-1):
+                    fleet.release(int(handle))
+
+            io_callback(free, None, state.handle)

@@ -1,0 +1,120 @@
+"""The outside of a Gymnasium environment: its actions, and a vector of what it shows."""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from rtd3jax.envs.entry import DEFAULT_STEP_LIMIT
+from rtd3jax.errors import UserError
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Surface:
+    """What the outside of an environment is like."""
+
+    actions: gymnasium.spaces.Box
+    names: tuple[str, ...]
+    keep: tuple[int, ...]
+    limit: int
+
+    @functools.cached_property
+    def indices(self) -> np.ndarray:
+        """The elements that are seen, as an index."""
+        return np.asarray(self.keep)
+
+    @functools.cached_property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest action, float64."""
+        return self.actions.low.astype(np.float64), self.actions.high.astype(np.float64)
+
+    def command(self, action: np.ndarray) -> np.ndarray:
+        """What the environment is given for an ``action`` [A]: within its bounds, in its type."""
+        low, high = self.bounds
+        wide = action.astype(np.float64).reshape(low.shape)
+        return np.minimum(np.maximum(wide, low), high).astype(self.actions.dtype)
+
+    def seen(self, flat: np.ndarray) -> np.ndarray:
+        """The kept elements of all that it showed, float32 [O]."""
+        return flat[self.indices].astype(np.float32)
+
+
+def surface_of(
+    example: gymnasium.Env, title: str, keep: Iterable[int] | slice | None, limit: int | None
+) -> tuple[Surface, Callable[[Any], np.ndarray]]:
+    actions, seen = example.action_space, example.observation_space
+    if not isinstance(actions, gymnasium.spaces.Box):
+        raise UserError(
+            f"{title} has the actions {actions}; rtd3jax learns continuous ones: choose an "
+            "environment whose action space is a bounded Box"
+        )
+    if not (np.isfinite(actions.low).all() and np.isfinite(actions.high).all()):
+        raise UserError(
+            f"{title} has unbounded actions: give them finite bounds, for example by "
+            "gymnasium.wrappers.RescaleAction in a function that makes it"
+        )
+    names = tuple(_names(seen, "", title))
+    every = range(len(names))
+    indices = (
+        tuple(every)
+        if keep is None
+        else tuple(every[keep])
+        if isinstance(keep, slice)
+        else tuple(int(index) for index in keep)
+    )
+    if not indices or len(set(indices)) < len(indices) or min(indices) < 0:
+        raise UserError(f"keep={keep!r} must name distinct elements, not negative, at least one")
+    if max(indices) >= len(names):
+        raise UserError(f"keep={max(indices)} is not in {title}'s observation of {len(names)}")
+    if limit is None:
+        spec = getattr(example, "spec", None)
+        limit = getattr(spec, "max_episode_steps", None) or DEFAULT_STEP_LIMIT
+    if isinstance(limit, bool) or limit != int(limit) or limit < 1:
+        raise UserError(f"max_steps_in_episode={limit!r} must be an integer of at least 1")
+    size = len(names)
+
+    def read(observation: object) -> np.ndarray:
+        flat = _flat(seen, observation)
+        if flat.shape != (size,):
+            raise ValueError(f"it has {flat.size} elements instead of {size}")
+        return flat
+
+    return Surface(actions, names, indices, int(limit)), read
+
+
+def _names(space: gymnasium.Space, name: str, title: str) -> Iterable[str]:
+    if isinstance(space, gymnasium.spaces.Dict):
+        for key, part in space.items():
+            yield from _names(part, f"{name}.{key}" if name else str(key), title)
+    elif isinstance(space, gymnasium.spaces.Tuple):
+        for index, part in enumerate(space):
+            yield from _names(part, f"{name}.{index}" if name else str(index), title)
+    elif isinstance(space, gymnasium.spaces.Box):
+        if space.dtype == np.uint8 or len(space.shape) > 2:
+            raise UserError(
+                f"{title} has images {space.shape} as observations; rtd3jax learns from vectors: "
+                "put what they show into one, in a wrapper"
+            )
+        yield from (f"{name}[{k}]" if name else str(k) for k in range(math.prod(space.shape)))
+    else:
+        raise UserError(
+            f"{title} has observations {space}; rtd3jax learns from a Box, or a Dict or Tuple of "
+            "them: convert it in a wrapper (gymnasium.wrappers.TransformObservation)"
+        )
+
+
+def _flat(space: gymnasium.Space, observation: object) -> np.ndarray:
+    parts: Any = observation
+    if isinstance(space, gymnasium.spaces.Dict):
+        return np.concatenate([_flat(part, parts[key]) for key, part in space.items()])
+    if isinstance(space, gymnasium.spaces.Tuple):
+        pairs = zip(space, parts, strict=True)
+        return np.concatenate([_flat(part, value) for part, value in pairs])
+    array = np.asarray(observation, np.float64)
+    if array.shape != space.shape:
+        raise ValueError(f"it has the shape {array.shape} instead of {space.shape}")
+    return array.reshape(-1)
