@@ -83,7 +83,7 @@ def test_bounds(tmp_path, capsys):
     assert min(row[part] for part in ("products", "gates", "optimisers")) > 0
     assert "| geometric mean |" in (tmp_path / "bounds.md").read_text()
     assert bounds.main([*arguments, "--lengths", "3"]) == 2
-    assert "l = 3 has no measurements" in capsys.readouterr().err
+    assert "PyTorch at l = 3; run" in capsys.readouterr().err
 
 
 def test_a_bound_is_what_products_gates_and_optimisers_leave():

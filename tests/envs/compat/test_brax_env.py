@@ -167,7 +167,7 @@ class Failing(Cart):
     ("env", "options", "match"),
     [
         (object(), {}, "no reset"),
-        (NoState(), {}, "lacks obs, reward"),
+        (NoState(), {}, "has no obs, reward"),
         (AutoReset(), {}, "AutoResetWrapper"),
         (Batch(), {}, "VmapWrapper"),
         (Failing(), {}, "failed in reset: RuntimeError: no model"),

@@ -76,5 +76,5 @@ def test_under_noise_it_earns_most_of_what_there_is():
 def test_other_environments_are_refused_in_one_line():
     with pytest.raises(rtd.UserError, match="only known for the pendulum"):
         rtd.filter_policy(rtd.make("rover"))
-    with pytest.raises(rtd.UserError, match="does not cover Pulses"):
+    with pytest.raises(rtd.UserError, match="does not cover this Pulses"):
         rtd.filter_policy(rtd.make("pendulum", "temporal-bias"))
