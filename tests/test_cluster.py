@@ -131,7 +131,7 @@ def test_a_cell_asks_for_cores_and_the_planned_memory():
 def test_a_cell_that_no_node_can_hold_is_refused():
     with pytest.raises(UserError, match="memory, but the largest node has 1,024 MiB"):
         cluster._need(jobs(replay_capacity=5_000_000), Work("map", 4), nodes())
-    with pytest.raises(UserError, match="needs 1 GPU, the largest node has 0"):
+    with pytest.raises(UserError, match="needs 1 GPU, but the largest node has 0"):
         cluster._need(jobs(), Work("vmap", 4), nodes(memory=8 * 2**30))
 
 
