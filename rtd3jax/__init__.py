@@ -24,11 +24,14 @@ from rtd3jax.envs.processes.process import Chain, NoDisturbance, Nothing, Proces
 from rtd3jax.envs.processes.recorded import Recorded
 from rtd3jax.envs.registry import make, register
 from rtd3jax.envs.rover.optimum import bayes_policy
+from rtd3jax.envs.stress import Stress
 from rtd3jax.errors import UserError
 from rtd3jax.evaluation.ceiling import ceiling
 from rtd3jax.evaluation.episode import Trajectory, rollout
 from rtd3jax.evaluation.gymnasium import run_in_gymnasium
 from rtd3jax.evaluation.plot import plot_episode
+from rtd3jax.evaluation.robustness import robustness
+from rtd3jax.evaluation.robustness_plot import plot_robustness
 from rtd3jax.evaluation.rollout import evaluate
 from rtd3jax.identification.fit import fit_process
 from rtd3jax.identification.result import Estimate, Fit
@@ -73,6 +76,7 @@ __all__ = [
     "Recorded",
     "Run",
     "Sine",
+    "Stress",
     "Study",
     "Sum",
     "Trajectory",
@@ -99,11 +103,13 @@ __all__ = [
     "make_agent",
     "pid_policy",
     "plot_episode",
+    "plot_robustness",
     "random_policy",
     "register",
     "register_agent",
     "register_learner",
     "register_memory",
+    "robustness",
     "rollout",
     "run_in_gymnasium",
     "to_gymnasium",

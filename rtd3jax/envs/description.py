@@ -1,7 +1,7 @@
-"""Baselines, ceiling and drawing of an environment, which `rtd3jax.register` takes.
+"""Baselines, ceiling, drawing and stresses of an environment, which `rtd3jax.register` takes.
 
 All of these are optional. A study compares trained agents with the baselines and the ceiling, and
-the drawing defines how its page shows episodes.
+the drawing defines how its page shows episodes. The stresses are for a test of robustness.
 """
 
 import dataclasses
@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
+
+from rtd3jax.envs.stress import Stress
 
 
 class Ceiling(NamedTuple):
@@ -56,7 +58,7 @@ class Drawing:
 
 @dataclasses.dataclass(frozen=True)
 class Description:
-    """Baselines, ceiling and drawing of one environment.
+    """Baselines, ceiling, drawing and stresses of one environment.
 
     Attributes:
         baselines: functions by name. Each takes the environment with its disturbances and returns
@@ -66,11 +68,13 @@ class Description:
             mean that is sampled, and a seed. It returns a `Ceiling`, or the best policy, whose
             return is then measured. It raises UserError if neither is known.
         drawing: how to show an episode.
+        stresses: stresses of this environment, besides those that fit any environment.
     """
 
     baselines: Mapping[str, Callable[[Any], Any]] = dataclasses.field(default_factory=dict)
     ceiling: Callable[[Any, int, int], Any] | None = None
     drawing: Drawing | None = None
+    stresses: tuple[Stress, ...] = ()
 
     def or_else(self, other: "Description") -> "Description":
         """This description, in which parts of ``other`` fill the empty parts."""
@@ -78,4 +82,5 @@ class Description:
             self.baselines or other.baselines,
             self.ceiling or other.ceiling,
             self.drawing or other.drawing,
+            self.stresses or other.stresses,
         )

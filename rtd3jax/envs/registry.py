@@ -34,6 +34,7 @@ from rtd3jax.envs.processes.faults import (
 )
 from rtd3jax.envs.processes.mixture import Mixture
 from rtd3jax.envs.processes.process import NoDisturbance, Process, require
+from rtd3jax.envs.stress import SIGNAL_STRESSES, Stress, factor_stress
 from rtd3jax.errors import UserError, nearest
 from rtd3jax.protocols import EnvironmentLike
 
@@ -67,7 +68,7 @@ class _Entry:
         positive: parameters of the environment that must be greater than zero.
         reward_from_observation: disturbances under which the observation determines the reward.
         with_params: a function that makes the environment with given default parameters.
-        description: baselines, ceiling and drawing.
+        description: baselines, ceiling, drawing and stresses.
     """
 
     env: EnvironmentLike | None
@@ -125,6 +126,7 @@ def register(
     baselines: Mapping[str, Callable[[Any], Any]] | None = None,
     ceiling: Callable[[Any, int, int], Any] | None = None,
     drawing: Drawing | None = None,
+    stresses: Iterable[Stress] = (),
     with_params: Callable[[Any], Any] | None = None,
     try_disturbances: bool = True,
     replace: bool = False,
@@ -141,7 +143,8 @@ def register(
             with a process of the observation, or with a pair (channel, process). A channel is one
             that `disturb` takes, or the name of a parameter of the environment that holds a
             process and acts inside the dynamics.
-        positive: parameters of the environment that must be greater than zero.
+        positive: parameters of the environment that must be greater than zero. `rtd3jax.robustness`
+            multiplies each that is a float by 0.5 to 2.
         reward_from_observation: names of disturbances under which the environment's
             ``observed_reward`` computes the reward from the observation that the agent received,
             unless ``make`` is called with ``reward_from``.
@@ -150,6 +153,8 @@ def register(
         ceiling: the best possible return, for `rtd3jax.ceiling` and a study; see
             `rtd3jax.envs.description.Description`.
         drawing: how the page of a study shows an episode.
+        stresses: stresses of this environment for `rtd3jax.robustness`, besides those of any
+            environment.
         with_params: a function that makes the environment with given default parameters, for
             example its class. With this function, ``make`` returns an unwrapped environment if no
             channel of `disturb` is disturbed. Without it, ``make`` always wraps the environment.
@@ -168,7 +173,7 @@ def register(
     if isinstance(env, type) or not (is_environment or callable(env)):
         raise UserError(f"{env_id!r} must be an environment or a function, not {env!r}")
     _check_free(env_id, module, replace)
-    description = Description(dict(baselines or {}), ceiling, drawing)
+    description = Description(dict(baselines or {}), ceiling, drawing, tuple(stresses))
     extras = (tuple(positive), tuple(reward_from_observation), with_params, description)
     if not is_environment:
         if disturbances is not None or extras != ((), (), None, Description()):
@@ -182,6 +187,9 @@ def register(
     env = cast("EnvironmentLike", env)
     named = _named_processes(env_id, env, disturbances or {}, try_disturbances)
     _check_extras(env_id, env, named, extras)
+    factors = _factor_stresses(env_id, own_parameters(env), positive, description.stresses)
+    description = dataclasses.replace(description, stresses=(*description.stresses, *factors))
+    extras = (*extras[:3], description)
     known = next(
         (e.description for e in _entries.values() if e.env is not None and e.env == env), None
     )
@@ -261,6 +269,22 @@ def _check_extras(
                 f"{env_id!r}: a baseline cannot be called {name!r}; choose another name of "
                 "letters, digits, '-', '.' and '_'"
             )
+
+
+def _factor_stresses(
+    env_id: str, params: object, positive: Iterable[str], stresses: tuple[Stress, ...]
+) -> tuple[Stress, ...]:
+    """A stress for each positive float; UserError if two stresses have the same name."""
+    for stress in stresses:
+        if not isinstance(stress, Stress):
+            raise UserError(f"{env_id!r}: stresses must be rtd.Stress, not {stress!r}")
+    floats = [name for name in positive if isinstance(getattr(params, name), float)]
+    factors = tuple(factor_stress(name) for name in floats)
+    names = [stress.name for stress in (*SIGNAL_STRESSES, *stresses, *factors)]
+    for name in names:
+        if names.count(name) > 1:
+            raise UserError(f"{env_id!r}: two stresses are called {name!r}; rename one of them")
+    return factors
 
 
 def _named_processes(

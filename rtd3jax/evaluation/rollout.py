@@ -49,9 +49,7 @@ def both_returns(
 
     Both are float32 [episodes]; `evaluate` returns one of the two.
     """
-    for name, value, low in (("episodes", episodes, 1), ("seed", seed, 0)):
-        if isinstance(value, bool) or value != int(value) or not low <= value < 2**32:
-            raise UserError(f"{name} must be an integer of at least {low}, not {value!r}")
+    check_counts(episodes, seed)
     params = parameters_of(env, params)
     interface = describe(env, params)
     check_compatible(
@@ -61,9 +59,22 @@ def both_returns(
         interface.action_low,
         interface.action_high,
     )
+    return unchecked_returns(policy, env, int(episodes), int(seed), params)
+
+
+def check_counts(episodes: int, seed: int) -> None:
+    """Raise UserError for an impossible number of episodes or an impossible seed."""
+    for name, value, low in (("episodes", episodes, 1), ("seed", seed, 0)):
+        if isinstance(value, bool) or value != int(value) or not low <= value < 2**32:
+            raise UserError(f"{name} must be an integer of at least {low}, not {value!r}")
+
+
+def unchecked_returns(
+    policy: PolicyLike, env: EnvironmentLike, episodes: int, seed: int, params: object
+) -> tuple[jax.Array, jax.Array]:
+    """As `both_returns`, without checks."""
     make_room()
-    key = jax.random.key(int(seed))
-    return _episode_returns(policy, env, params, key, int(episodes))
+    return _episode_returns(policy, env, params, jax.random.key(seed), episodes)
 
 
 @functools.partial(jax.jit, static_argnames=("env", "episodes"))

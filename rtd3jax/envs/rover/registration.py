@@ -1,4 +1,4 @@
-"""Registers the rover with its disturbances, baselines, ceiling and drawing."""
+"""Registers the rover with its disturbances, baselines, ceiling, drawing and stresses."""
 
 from typing import Any
 
@@ -8,9 +8,10 @@ from rtd3jax.envs.controllers import PIDPolicy, pid_policy
 from rtd3jax.envs.description import Drawing
 from rtd3jax.envs.interface import describe
 from rtd3jax.envs.registry import register
-from rtd3jax.envs.rover.environment import Rover, RoverState
+from rtd3jax.envs.rover.environment import Rover, RoverParams, RoverState
 from rtd3jax.envs.rover.optimum import best_return
-from rtd3jax.envs.rover.slip import Ar1Slip, SineSlip
+from rtd3jax.envs.rover.slip import Ar1Slip, ConstantSlip, SineSlip
+from rtd3jax.envs.stress import Stress
 from rtd3jax.protocols import EnvironmentLike
 
 
@@ -40,6 +41,18 @@ def next_slip(state: RoverState) -> jax.Array | None:
     return next((part.slip for part in parts if hasattr(part, "slip")), None)
 
 
+def _constant_slip(params: RoverParams, slip: float) -> RoverParams:
+    return params.replace(slip=ConstantSlip(float(slip)))
+
+
+def _slip_bound(params: RoverParams, bound: float) -> RoverParams:
+    """The rover with its own AR(1) slip, or with that of the paper, and another bound."""
+    own = params.slip if isinstance(params.slip, Ar1Slip) else Ar1Slip()
+    return params.replace(slip=own.replace(max_slip=float(bound)))
+
+
+_SLIPS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
+
 register(
     "rover",
     Rover(),
@@ -62,6 +75,10 @@ register(
         hidden=next_slip,
         hidden_name="slip",
         hidden_elements=("left", "right"),
+    ),
+    stresses=(
+        Stress("slip", _SLIPS, _constant_slip, "constant slip of both wheels"),
+        Stress("slip-bound", _SLIPS, _slip_bound, "largest AR(1) slip"),
     ),
     with_params=Rover,
     try_disturbances=False,  # the tests do so; the import stays fast

@@ -48,6 +48,26 @@ class Ar1Slip(Process):
         require(self, "max_slip", low=0, high=1)
 
 
+class ConstantSlip(Process):
+    """The same constant slip of both wheels, for a test of robustness."""
+
+    slip: float = 0.0
+
+    def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> Ar1SlipState:
+        """The slip, which has no random part."""
+        return Ar1SlipState(slip=jnp.broadcast_to(float32(self.slip), (WHEELS,)))
+
+    def step(
+        self, key: jax.Array, state: Ar1SlipState, signal: jax.Array
+    ) -> tuple[jax.Array, Ar1SlipState]:
+        """Apply the slip."""
+        return (1.0 - state.slip) * signal, state
+
+    def validate(self) -> None:
+        """Check that the slip is physically possible."""
+        require(self, "slip", low=0, high=1)
+
+
 class SineSlipState(struct.PyTreeNode):
     """The waves of an episode, one for each wheel."""
 
