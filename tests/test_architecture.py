@@ -26,6 +26,7 @@ LAYERS = {
     "sweep": 10,
     "report": 10,
     "transfer": 10,
+    "stress": 10,
     "compare": 10,
     "export": 10,
     "__main__": 10,

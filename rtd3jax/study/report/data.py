@@ -47,9 +47,9 @@ def study_data(
     lanes: pd.DataFrame,
     notes: list[str],
 ) -> dict[str, Any]:
-    """All data except ceilings, transfer and playback; missing data add a line to ``notes``.
+    """All data except ceilings, transfer, robustness and playback.
 
-    ``lanes`` are the `seed_means` of ``episodes``.
+    Missing data add a line to ``notes``. ``lanes`` are the `seed_means` of ``episodes``.
     """
     log = read_log(directory.path / LOG)
     curves = _with_log(curves, log, directory)

@@ -13,6 +13,8 @@ from rtd3jax.errors import UserError, first_line
 from rtd3jax.study.ceilings import ceilings_of
 from rtd3jax.study.report.data import study_data, tables_of
 from rtd3jax.study.report.playback import recordings
+from rtd3jax.study.report.robustness import FILE as ROBUSTNESS
+from rtd3jax.study.report.robustness import robustness_data
 from rtd3jax.study.report.transfer import FILE as TRANSFER
 from rtd3jax.study.report.transfer import transfer_data
 from rtd3jax.study.rundir import RunDirectory
@@ -31,6 +33,7 @@ _SCRIPTS = (
     "finals",
     "table",
     "transfer",
+    "robustness",
     "player",
     "main",
 )
@@ -87,6 +90,11 @@ def page_data(directory: RunDirectory, *, complete: bool, playback: bool) -> dic
         data["transfer"] = transfer_data(directory.path / TRANSFER)
     except UserError as error:
         data["transfer"] = None
+        notes.append(str(error))
+    try:
+        data["robustness"] = robustness_data(directory.path / ROBUSTNESS, directory.cells)
+    except UserError as error:
+        data["robustness"] = None
         notes.append(str(error))
     data["playback"] = []
     if playback:

@@ -64,7 +64,7 @@ const tip = {
 
 const swatch = (agent) => el('span', { class: 'swatch', style: `color: var(--a${agent})`, 'aria-hidden': 'true' });
 
-// The frame of a plot: gridlines and numbers. x is environment steps, y is a return.
+// The frame of a plot: gridlines and numbers. x is environment steps or a strength, y is a return.
 function axes({ width, height, x, y, label }) {
   const marks = ticks(y[0], y[1], 4);
   const texts = marks.values.map((value) => fixed(value, marks.decimals));

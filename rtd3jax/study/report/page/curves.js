@@ -57,7 +57,9 @@ function legendItems(panels) {
   return items;
 }
 
-function curvePanel({ environment, length, cells, range, title: given }, width) {
+const stepWords = (step) => `step ${step.toLocaleString('en')}`;
+
+function curvePanel({ environment, length, cells, range, title: given, under, at = stepWords }, width) {
   const title = given ?? [environmentName(environment), length ? lengthName(length) : null].filter(Boolean).join(', ');
   const drawn = cells.filter((cell) => cell.curves[state.measure]);
   const figure = el('figure', {}, el('figcaption', {}, title));
@@ -67,7 +69,8 @@ function curvePanel({ environment, length, cells, range, title: given }, width) 
   }
   const height = 230;
   const last = Math.max(...drawn.map((cell) => Math.max(...cell.curves[state.measure].steps)));
-  const plot = axes({ width, height, x: [0, last], y: [range.low, range.high], label: title });
+  const first = Math.min(0, ...drawn.flatMap((cell) => cell.curves[state.measure].steps));
+  const plot = axes({ width, height, x: [first, last], y: [range.low, range.high], label: title });
   for (const reference of range.near) {
     const y = plot.y(reference.value);
     plot.svg.append(draw('line', { class: 'reference', x1: plot.left, x2: plot.right, y1: y, y2: y, 'stroke-dasharray': dashOf(reference) }));
@@ -80,8 +83,9 @@ function curvePanel({ environment, length, cells, range, title: given }, width) 
     const y = reference.above ? plot.top + 12 + 13 * k : plot.bottom - 5 - 13 * k;
     plot.svg.append(draw('text', { class: 'note', x: plot.right - 4, y, 'text-anchor': 'end' }, words));
   });
-  readable(plot, drawn, title);
+  readable(plot, drawn, title, at);
   figure.append(plot.svg);
+  if (under) figure.append(el('p', { class: 'quantity' }, under));
   return figure;
 }
 
@@ -100,8 +104,8 @@ function curveLine(cell, plot) {
   return group;
 }
 
-// Hover, touch and arrow keys: the values at the nearest evaluation.
-function readable(plot, cells, title) {
+// Hover, touch and arrow keys: the values at the nearest point; `at` names the point.
+function readable(plot, cells, title, words) {
   const steps = [...new Set(cells.flatMap((cell) => cell.curves[state.measure].steps))].sort((a, b) => a - b);
   const cross = draw('line', { class: 'cross', y1: plot.top, y2: plot.bottom, visibility: 'hidden' });
   plot.svg.append(cross);
@@ -120,7 +124,7 @@ function readable(plot, cells, title) {
         return el('tr', {}, el('td', {}, swatch(cell.agent), ` ${DATA.agents[cell.agent].name}${of}`),
           el('td', { class: 'number' }, fixed(curve.iqm[k], plot.decimals)), el('td', { class: 'number' }, spread));
       });
-    tip.show(plot.svg, x, plot.top, el('strong', {}, `${title}: step ${steps[at].toLocaleString('en')}`), el('table', {}, el('tbody', {}, rows)));
+    tip.show(plot.svg, x, plot.top, el('strong', {}, `${title}: ${words(steps[at])}`), el('table', {}, el('tbody', {}, rows)));
   };
   const hide = () => { cross.setAttribute('visibility', 'hidden'); tip.hide(); };
   const nearest = (x) => steps.reduce((best, step, k) => (Math.abs(plot.x(step) - x) < Math.abs(plot.x(steps[best]) - x) ? k : best), 0);

@@ -42,7 +42,7 @@ function compact(value) {
   for (const [size, unit] of [[1e9, 'G'], [1e6, 'M'], [1e3, 'k']]) {
     if (Math.abs(value) >= size) return `${+(value / size).toPrecision(4)}${unit}`;
   }
-  return String(value).replace('-', MINUS);
+  return String(+value.toPrecision(6)).replace('-', MINUS);
 }
 
 const plural = (count, one, many) => `${count.toLocaleString('en')} ${count === 1 ? one : many || one + 's'}`;

@@ -59,6 +59,7 @@ function redraw() {
   drawFinals();
   drawTable();
   drawTransfer();
+  drawRobustness();
 }
 
 colours();

@@ -1,0 +1,87 @@
+"""The test of robustness of a study, as data of its page."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from rtd3jax.errors import UserError
+from rtd3jax.study.plan import Cell
+from rtd3jax.study.report.data import MEASURES, rows_of
+from rtd3jax.study.results import CELL, rounded_number
+from rtd3jax.study.statistics import iqm_bands
+
+FILE = "robustness.parquet"
+COLUMNS = (
+    *CELL,
+    "seed",
+    "stress",
+    "quantity",
+    "value",
+    "return",
+    "standard_error",
+    "true_return",
+    "true_standard_error",
+    "episodes",
+)
+"""One row per lane, stress and value: means over the episodes of a lane."""
+
+
+def read_robustness(path: Path) -> pd.DataFrame | None:
+    """The table; None if there is none.
+
+    Raises:
+        UserError: when the file exists, but is not such a table.
+    """
+    if not path.is_file():
+        return None
+    try:
+        table = pd.read_parquet(path)
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path.name} cannot be read ({str(error).splitlines()[0]})") from error
+    missing = [name for name in COLUMNS if name not in table.columns]
+    if missing:
+        raise UserError(f"{path.name} has no columns {', '.join(missing)}")
+    return table
+
+
+def robustness_data(path: Path, cells: list[Cell]) -> list[dict[str, Any]] | None:
+    """Each stress of each cell, with a curve over its values; None without a table.
+
+    ``cell`` is an index of ``cells``. A curve is the interquartile mean over the seeds, with the
+    bounds of its interval, as of learning curves.
+
+    Raises:
+        UserError: when the file exists, but is not such a table.
+    """
+    table = read_robustness(path)
+    if table is None:
+        return None
+    return [
+        {
+            "cell": index,
+            "stress": stress,
+            "quantity": str(rows["quantity"].iloc[0]),
+            "curves": {measure: _curve(rows, measure) for measure in MEASURES},
+        }
+        for index, cell in enumerate(cells)
+        for stress, rows in rows_of(table, cell).groupby("stress", sort=False)
+    ]
+
+
+def _curve(rows: pd.DataFrame, measure: str) -> dict[str, Any] | None:
+    """IQM over the seeds with the bounds of its interval, at each value of a stress."""
+    rows = rows[np.isfinite(rows[measure].astype(np.float64))]
+    if rows.empty:
+        return None
+    table = rows.pivot(index="seed", columns="value", values=measure)
+    count, iqm, low, high = iqm_bands(table.to_numpy(np.float64))
+    return {
+        # The page's curves have their points at "steps".
+        "steps": [rounded_number(value) for value in table.columns],
+        "seeds": [int(seeds) for seeds in count],
+        "iqm": [rounded_number(value) for value in iqm],
+        "low": [rounded_number(value) for value in low],
+        "high": [rounded_number(value) for value in high],
+    }

@@ -1,0 +1,117 @@
+"""Tests the robustness of the trained agents of a run."""
+
+import io
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from rtd3jax.errors import UserError
+from rtd3jax.evaluation.robustness import Case, check_policy, make_cases, rows_of
+from rtd3jax.evaluation.robustness_plot import plot_robustness
+from rtd3jax.evaluation.rollout import check_counts
+from rtd3jax.study.colours import ordered
+from rtd3jax.study.plan import Cell
+from rtd3jax.study.report.robustness import COLUMNS, FILE
+from rtd3jax.study.rundir import RunDirectory
+from rtd3jax.system.files import write_bytes_atomically
+
+
+def run_robustness(
+    directory: RunDirectory,
+    stresses: Sequence[str] | None,
+    episodes: int,
+    say: Callable[[str], None] = print,
+) -> pd.DataFrame:
+    """Test every trained policy of ``directory``; write ``robustness.parquet`` and pictures.
+
+    Args:
+        directory: the run directory.
+        stresses: stresses, as `rtd3jax.robustness` takes them; all stresses of each environment by
+            default. In a run of several environments, a stress may be unknown to some of them.
+        episodes: number of episodes for each policy and value. The seed of a lane is also the seed
+            of its episodes, so agents with the same seed meet the same episodes.
+        say: receives a line if a stress does not fit an environment.
+
+    Raises:
+        UserError: for an unknown stress or an impossible value, or when nothing is trained yet.
+    """
+    check_counts(episodes, 0)
+    lanes = [
+        (cell, seed)
+        for cell in directory.cells
+        for seed in directory.seeds
+        if directory.lanes.is_done(cell, seed)
+    ]
+    if not lanes:
+        raise UserError(
+            f"{directory.path} has no finished lane that could be tested: --status prints the lanes"
+        )
+    cases = _all_cases([cell for cell, _ in lanes], stresses, say)
+    rows: list[dict[str, Any]] = []
+    for cell, seed in lanes:
+        own = cases.get((cell.env, cell.disturbance))
+        if own is None:
+            continue
+        policy = directory.lanes.policy(cell, seed)
+        check_policy(policy, own)
+        identity = {**cell.key, "seed": seed}
+        rows += [{**identity, **row} for row in rows_of(policy, own, episodes, seed)]
+    table = pd.DataFrame(rows, columns=list(COLUMNS))
+    write_bytes_atomically(directory.path / FILE, table.to_parquet(index=False))
+    return table
+
+
+def draw_robustness(table: pd.DataFrame, directory: Path) -> list[Path]:
+    """Draw a picture for each environment and disturbance; return the paths.
+
+    A line is the mean over the seeds, with a band of two standard errors of this mean.
+    """
+    paths = []
+    for (env, disturbance), rows in table.groupby(["env", "disturbance"], sort=False):
+        # As in the names of the lanes' directories.
+        text = f"robustness_{env}_{str(disturbance).replace('/', '~')}"
+        name = re.sub(r"[^A-Za-z0-9._=+~-]", "-", text)
+        buffer = io.BytesIO()
+        title = f"{env}, trained under {disturbance}"
+        plot_robustness(over_seeds(rows), title=title).savefig(buffer, format="png")
+        paths.append(directory / f"{name}.png")
+        write_bytes_atomically(paths[-1], buffer.getvalue())
+    return paths
+
+
+def over_seeds(rows: pd.DataFrame) -> pd.DataFrame:
+    """Means over the seeds, with their standard errors, as a table for `plot_robustness`."""
+    agents = rows[["algorithm", "history_length"]].drop_duplicates()
+    several = len(set(agents["history_length"]) - {0}) > 1
+    found = []
+    for algorithm in ordered(agents["algorithm"]):
+        for length in agents.loc[agents["algorithm"] == algorithm, "history_length"]:
+            own = rows[(rows["algorithm"] == algorithm) & (rows["history_length"] == length)]
+            returns = own.groupby(["stress", "quantity", "value"], sort=False)["return"]
+            mean = returns.agg(lambda seeds: seeds.mean(skipna=False))
+            error = returns.std(ddof=1) / np.sqrt(returns.count())
+            means = pd.DataFrame({"return": mean, "standard_error": error}).reset_index()
+            name = f"{algorithm}, history {length}" if several and length else algorithm
+            found.append(means.assign(policy=name))
+    return pd.concat(found, ignore_index=True)
+
+
+def _all_cases(
+    cells: Sequence[Cell], stresses: Sequence[str] | None, say: Callable[[str], None]
+) -> dict[tuple[str, str], list[Case]]:
+    """The cases of each environment and disturbance, without those that no stress fits."""
+    cases: dict[tuple[str, str], list[Case]] = {}
+    problems: list[UserError] = []
+    for key, cell in {(cell.env, cell.disturbance): cell for cell in cells}.items():
+        try:
+            cases[key] = make_cases(cell.make_env(), stresses, env_id=cell.env)
+        except UserError as error:
+            problems.append(error)
+            say(f"not tested on {cell.env} with {cell.disturbance}: {error}")
+    if not cases:
+        raise problems[0]
+    return cases
