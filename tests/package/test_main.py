@@ -28,7 +28,7 @@ def test_every_command_is_said_with_its_purpose():
     holds_a_main = {
         p.stem for p in folder.glob("cli/*.py") if "\ndef main(" in p.read_text("utf-8")
     }
-    assert set(commands()) == holds_a_main and len(holds_a_main) == 5
+    assert set(commands()) == holds_a_main and len(holds_a_main) == 6
     assert all((folder / f"{name}.py").is_file() for name in commands())
     assert all(10 < len(purpose) < 70 for purpose in commands().values())
 
