@@ -64,8 +64,9 @@ const tip = {
 
 const swatch = (agent) => el('span', { class: 'swatch', style: `color: var(--a${agent})`, 'aria-hidden': 'true' });
 
-// The frame of a plot: gridlines and numbers. x is environment steps or a strength, y is a return.
-function axes({ width, height, x, y, label }) {
+// The frame of a plot: gridlines and numbers, one on the x axis for about `every` pixels. x is environment
+// steps or a strength, y is a return.
+function axes({ width, height, x, y, label, every = 90 }) {
   const marks = ticks(y[0], y[1], 4);
   const texts = marks.values.map((value) => fixed(value, marks.decimals));
   const left = 14 + 6.4 * Math.max(...texts.map((text) => text.length));
@@ -78,7 +79,7 @@ function axes({ width, height, x, y, label }) {
     svg.append(draw('line', { class: 'grid', x1: frame.left, x2: frame.right, y1: at, y2: at }));
     svg.append(draw('text', { x: frame.left - 6, y: at + 3.8, 'text-anchor': 'end' }, texts[k]));
   });
-  for (const value of ticks(x[0], x[1] || 1, Math.max(2, Math.floor(width / 90))).values) {
+  for (const value of ticks(x[0], x[1] > x[0] ? x[1] : x[0] + 1, Math.max(2, Math.floor(width / every))).values) {
     const at = frame.x(value);
     svg.append(draw('text', { x: at, y: height - 7, 'text-anchor': 'middle' }, compact(value)));
   }

@@ -69,8 +69,9 @@ function curvePanel({ environment, length, cells, range, title: given, under, at
   }
   const height = 230;
   const last = Math.max(...drawn.map((cell) => Math.max(...cell.curves[state.measure].steps)));
-  const first = Math.min(0, ...drawn.flatMap((cell) => cell.curves[state.measure].steps));
-  const plot = axes({ width, height, x: [first, last], y: [range.low, range.high], label: title });
+  // Steps begin at zero and have long numbers; the values of a quantity begin anywhere.
+  const first = under ? Math.min(...drawn.flatMap((cell) => cell.curves[state.measure].steps)) : 0;
+  const plot = axes({ width, height, x: [first, last], every: under ? 50 : 90, y: [range.low, range.high], label: title });
   for (const reference of range.near) {
     const y = plot.y(reference.value);
     plot.svg.append(draw('line', { class: 'reference', x1: plot.left, x2: plot.right, y1: y, y2: y, 'stroke-dasharray': dashOf(reference) }));
