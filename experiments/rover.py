@@ -172,9 +172,22 @@ def table(rows: pd.DataFrame, others: dict[str, dict[str, str]], setting: str) -
             here = pick(rows, algorithm, trained, tested)
             mine.append(spread(here, setting) if len(here) else "not trained yet")
         body += [mine, ["paper", *PAPER[algorithm]]]
+    body += fine_tuned()
     for name, values in others.items():
         body.append([f"*{name}*", *(values[tested] for _, tested in COLUMNS)])
     return "\n".join([markdown_table(header, body), *notes({*rows["setting"]} - {setting})])
+
+
+def fine_tuned() -> list[list[str]]:
+    """The row of an agent that was trained on sine slip and then briefly on AR(1) slip."""
+    path = RESULTS / "fine_tuning.parquet"
+    if not path.exists():
+        return []
+    found = pd.read_parquet(path)
+    found = found[found["way"] == "with critics and optimisers"]["mean"]
+    value = f"{found.mean():.2f} ± {found.std(ddof=1):.2f}"
+    name = "**lstm-td3-1ha1hc**, then 5,000 steps on ar1-slip"
+    return [[name, *(value if c == ("sine-slip", "ar1-slip") else "–" for c in COLUMNS)]]
 
 
 def order(rows: pd.DataFrame) -> str:
