@@ -2,11 +2,11 @@
 
 Usage: python experiments/one_agent_search.py [--quick] [--out FILE]
 
-The paper's agents are trained under one disturbance, and those of a sine fail under noise. Here each
-episode of the training draws its disturbance from a mixture. Two seeds of each setting, from 100 on,
-which are not reported elsewhere; tested on 400 episodes of each condition. Writes
-experiments/results/one_agent_search.csv, a row per setting, losers included; a setting whose row is
-there already is not trained again.
+The paper's agents are trained under one disturbance, and those of a sine fail under noise. Here
+each episode of the training draws its disturbance from a mixture. Each setting has two seeds, from
+100 on, which are not reported elsewhere, and is tested on 400 episodes of each condition. The
+script writes experiments/results/one_agent_search.csv: a row per setting, losers included. A
+setting that has a row is not trained again.
 
 `structured` is the worst of the structured conditions, normalised (0 is the uniform-random policy,
 1 the fully observed optimum); `noise` is the same under noise, divided by that of the model-based

@@ -33,9 +33,11 @@ def test_killed_sweeps_resume_to_the_same_bits(monkeypatch):
     assert load(EXPERIMENTS / "reliability" / "kill_and_resume.py").main(["--quick"]) == 0
 
 
-@pytest.mark.parametrize("plant", ["rover", "pendulum"])
-def test_the_search_runs_and_keeps_its_rows(plant, tmp_path, monkeypatch):
-    search = load(EXPERIMENTS / f"{plant}_search.py")
+@pytest.mark.parametrize(
+    "searched", ["rover", "pendulum", pytest.param("one_agent", marks=pytest.mark.slow)]
+)
+def test_the_search_runs_and_keeps_its_rows(searched, tmp_path, monkeypatch):
+    search = load(EXPERIMENTS / f"{searched}_search.py")
     monkeypatch.setattr(search, "scale", lambda name: (-1200.0, -136.0), raising=False)
     monkeypatch.setattr(search, "CHANGES", ({"gamma": 0.5},))
     out = tmp_path / "search.csv"
