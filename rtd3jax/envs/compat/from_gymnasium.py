@@ -89,7 +89,7 @@ def _named(kwargs: dict[str, Any]) -> str:
 def _example(make: Callable[[], Any], env: object, title: str) -> gymnasium.Env:
     try:
         example = make()
-    except gymnasium.error.DependencyNotInstalled as error:
+    except (gymnasium.error.DependencyNotInstalled, ImportError) as error:
         raise UserError(
             f"{title} needs a package that is missing ({first_line(error)}): "
             "pip install 'rtd3jax[mujoco]' for those of MuJoCo"

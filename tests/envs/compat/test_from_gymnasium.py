@@ -252,6 +252,10 @@ def fails():
     raise OSError("no licence")
 
 
+def lacks_a_package():
+    raise ModuleNotFoundError("No module named 'imageio'")
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [
@@ -259,6 +263,7 @@ def fails():
         (Unbounded, "give them finite bounds"),
         (Images, "images"),
         (fails, "no licence"),
+        (lacks_a_package, "needs a package that is missing (No module named 'imageio'): pip"),
         ("Pendulumm-v1", "did you mean 'Pendulum-v1'"),
         (lambda: gymnasium.make_vec("Pendulum-v1", 2), "every lane makes its own"),
         (lambda: 3, "not a gymnasium.Env"),
