@@ -15,7 +15,8 @@ import numpy as np
 import pandas as pd
 
 import rtd3jax as rtd
-from rtd3jax.envs.rover_soil.controllers import adaptive_slip, constant_command
+from rtd3jax.envs.rover.controllers import target_pi
+from rtd3jax.envs.rover_soil.controllers import adaptive_slip
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
@@ -39,7 +40,7 @@ def main(arguments: list[str] | None = None) -> int:
         (
             "feedforward-pi",
             f"kp={kp:g} ki={ki:g}",
-            rtd.pid_policy(env, kp=kp, ki=ki, feedforward=constant_command(env), ignored=1),
+            target_pi(env, kp, ki),
         )
         for kp, ki in pairs
     ]

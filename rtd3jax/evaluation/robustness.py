@@ -24,8 +24,7 @@ from rtd3jax.protocols import EnvironmentLike, PolicyLike
 if TYPE_CHECKING:  # importing pandas takes half a second
     import pandas as pd
 
-COLUMNS = (
-    "policy",
+MEASURED = (
     "stress",
     "quantity",
     "value",
@@ -35,6 +34,9 @@ COLUMNS = (
     "true_standard_error",
     "episodes",
 )
+"""What is known of a policy under one value of a stress: the columns of `rows_of`."""
+
+COLUMNS = ("policy", *MEASURED)
 """Columns of a table of robustness; a row per policy, stress and value."""
 
 _CHANNELS = ("observation", "action")

@@ -147,6 +147,12 @@ class LaneFiles:
 
 def cell_name(cell: Cell) -> str:
     """The unique directory name of a cell."""
-    disturbance = cell.disturbance.replace("/", "~")  # "-" stands for any other character
-    text = f"{cell.env}_{disturbance}_{cell.config.algorithm}_l{cell.config.history_length}"
+    length = f"l{cell.config.history_length}"
+    return file_name(cell.env, cell.disturbance, cell.config.algorithm, length)
+
+
+def file_name(env: str, disturbance: str, *rest: str) -> str:
+    """A file name of an environment, its disturbance, and what else there is."""
+    # "~" separates alternatives; "-" stands for any other character.
+    text = "_".join((env, disturbance.replace("/", "~"), *rest))
     return re.sub(r"[^A-Za-z0-9._=+~-]", "-", text)

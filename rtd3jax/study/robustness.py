@@ -1,7 +1,6 @@
 """Tests the robustness of the trained agents of a run."""
 
 import io
-import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from rtd3jax.evaluation.robustness import Case, check_policy, make_cases, rows_o
 from rtd3jax.evaluation.robustness_plot import plot_robustness
 from rtd3jax.evaluation.rollout import check_counts
 from rtd3jax.study.colours import ordered
+from rtd3jax.study.lane_files import file_name
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.report.robustness import COLUMNS, FILE
 from rtd3jax.study.rundir import RunDirectory
@@ -72,13 +72,10 @@ def draw_robustness(table: pd.DataFrame, directory: Path) -> list[Path]:
     """
     paths = []
     for (env, disturbance), rows in table.groupby(["env", "disturbance"], sort=False):
-        # As in the names of the lanes' directories.
-        text = f"robustness_{env}_{str(disturbance).replace('/', '~')}"
-        name = re.sub(r"[^A-Za-z0-9._=+~-]", "-", text)
         buffer = io.BytesIO()
         title = f"{env}, trained under {disturbance}"
         plot_robustness(over_seeds(rows), title=title).savefig(buffer, format="png")
-        paths.append(directory / f"{name}.png")
+        paths.append(directory / f"robustness_{file_name(str(env), str(disturbance))}.png")
         write_bytes_atomically(paths[-1], buffer.getvalue())
     return paths
 

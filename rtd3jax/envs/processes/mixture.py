@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from rtd3jax.envs.processes.process import Process
+from rtd3jax.envs.processes.process import Composition
 from rtd3jax.errors import UserError
 
 
@@ -16,14 +16,13 @@ class MixtureState(struct.PyTreeNode):
     members: tuple
 
 
-class Mixture(Process):
+class Mixture(Composition):
     """One of several processes, which is drawn at the start of an episode and acts in all of it.
 
     The agent does not observe which process was drawn. Each member has its own random stream. The
     outputs of all members must have the same number of elements.
     """
 
-    processes: tuple[Process, ...] = ()
     weights: tuple[int, ...] = struct.field(pytree_node=False, default=())
     """Relative frequency of each member; () means equal frequencies."""
 
@@ -32,11 +31,7 @@ class Mixture(Process):
         weights = self.weights or (1,) * len(self.processes)
         logits = jnp.log(jnp.asarray(weights, jnp.float32))
         kind = jax.random.categorical(jax.random.fold_in(key, len(self.processes)), logits)
-        members = tuple(
-            process.init(jax.random.fold_in(key, index), horizon, size)
-            for index, process in enumerate(self.processes)
-        )
-        return MixtureState(kind.astype(jnp.int32), members)
+        return MixtureState(kind.astype(jnp.int32), super().init(key, horizon, size))
 
     def step(
         self, key: jax.Array, state: MixtureState, signal: jax.Array
@@ -79,10 +74,4 @@ class Mixture(Process):
             raise UserError(
                 f"Mixture: weights={self.weights} must not be negative, and one must be positive"
             )
-        for process in self.processes:
-            process.validate()
-
-    def check_use(self, horizon: int, field: str) -> None:
-        """Check every member."""
-        for process in self.processes:
-            process.check_use(horizon, field)
+        super().validate()

@@ -58,10 +58,31 @@ Nothing = NoDisturbance
 """The name of `NoDisturbance` in earlier versions."""
 
 
-class Chain(Process):
-    """Several processes in sequence, each with its own random stream."""
+class Composition(Process):
+    """Several processes in one; the base of `Chain`, `Sum` and `Mixture`."""
 
     processes: tuple[Process, ...] = ()
+
+    def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> Any:
+        """The tuple of the members' states, each of the same signal, with its own random stream."""
+        return tuple(
+            process.init(jax.random.fold_in(key, index), horizon, size)
+            for index, process in enumerate(self.processes)
+        )
+
+    def validate(self) -> None:
+        """Validate every member."""
+        for process in self.processes:
+            process.validate()
+
+    def check_use(self, horizon: int, field: str) -> None:
+        """Check every member."""
+        for process in self.processes:
+            process.check_use(horizon, field)
+
+
+class Chain(Composition):
+    """Several processes in sequence, each with its own random stream."""
 
     def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> tuple:
         """The tuple of the members' states."""
@@ -85,32 +106,13 @@ class Chain(Process):
             size = process.output_size(size)
         return size
 
-    def validate(self) -> None:
-        """Validate every member."""
-        for process in self.processes:
-            process.validate()
 
-    def check_use(self, horizon: int, field: str) -> None:
-        """Check every member."""
-        for process in self.processes:
-            process.check_use(horizon, field)
-
-
-class Sum(Process):
+class Sum(Composition):
     """Several processes in parallel: each reads the clean signal, and their offsets are added.
 
     Each process has its own random stream. In a `Chain`, a process reads the output of the previous
     one; here, no process reads the output of another, so their order does not matter.
     """
-
-    processes: tuple[Process, ...] = ()
-
-    def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> tuple:
-        """The tuple of the members' states."""
-        return tuple(
-            process.init(jax.random.fold_in(key, index), horizon, size)
-            for index, process in enumerate(self.processes)
-        )
 
     def step(self, key: jax.Array, state: tuple, signal: jax.Array) -> tuple[jax.Array, tuple]:
         """Add every member's offset to the signal."""
@@ -130,16 +132,6 @@ class Sum(Process):
                     "is not defined; use a Chain"
                 )
         return size
-
-    def validate(self) -> None:
-        """Validate every member."""
-        for process in self.processes:
-            process.validate()
-
-    def check_use(self, horizon: int, field: str) -> None:
-        """Check every member."""
-        for process in self.processes:
-            process.check_use(horizon, field)
 
 
 def check_uses(params: object, unlimited: int) -> None:

@@ -9,13 +9,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from gymnax.environments import environment, spaces
 from jax.typing import ArrayLike
 
-from rtd3jax.envs.identity import ValueIdentity, strong
+from rtd3jax.envs.identity import strong
 from rtd3jax.envs.processes.process import NoDisturbance, Process, float32
 from rtd3jax.envs.rover.scene import RoverScene
 from rtd3jax.envs.rover.slip import WHEELS
+from rtd3jax.envs.rover.task import DrivingTask, errors, limits, sides
 
 
 class RoverParams(struct.PyTreeNode):
@@ -48,7 +48,7 @@ class RoverState(struct.PyTreeNode):
     """state of the slip process"""
 
 
-class Rover(ValueIdentity, environment.Environment):
+class Rover(DrivingTask):
     """Task: hold a speed and a yaw rate. Actions [2] command them; observations [2] are errors."""
 
     def __init__(self, default_params: RoverParams | None = None) -> None:
@@ -68,17 +68,16 @@ class Rover(ValueIdentity, environment.Environment):
             yaw_rate=jnp.zeros((), jnp.float32),
             slip=params.slip.init(key, params.max_steps_in_episode, WHEELS),
         )
-        return _errors(state, params), strong(state)
+        return errors(state, params), strong(state)
 
     def step_env(
         self, key: jax.Array, state: RoverState, action: ArrayLike, params: RoverParams
     ) -> tuple[jax.Array, RoverState, jax.Array, jax.Array, dict[Any, Any]]:
         """Command ``action`` [2]; the reward [] belongs to the resulting motion."""
-        limit = _limits(params)
+        limit = limits(params)
         command = jnp.clip(jnp.asarray(action, jnp.float32), -limit, limit)
         wheelbase = float32(params.wheelbase)
-        turn = 0.5 * wheelbase * command[1]
-        nominal = jnp.stack([command[0] - turn, command[0] + turn])
+        nominal = sides(command[0], command[1], wheelbase)
         realised, slip = params.slip.step(key, state.slip, nominal)
         evolved = RoverState(
             time=state.time + 1,
@@ -86,15 +85,7 @@ class Rover(ValueIdentity, environment.Environment):
             yaw_rate=(realised[1] - realised[0]) / wheelbase,
             slip=slip,
         )
-        observation = _errors(evolved, params)
-        reward = -jnp.sum(observation**2)
-        observation, evolved = self._apply_transition_gradient_policy(observation, strong(evolved))
-        terminated = self.is_terminated(evolved, params)
-        return observation, evolved, reward, terminated, {"true_reward": reward}
-
-    def is_terminated(self, state: RoverState, params: RoverParams) -> jax.Array:
-        """Always false: only the time limit ends an episode."""
-        return jnp.zeros((), jnp.bool_)
+        return self.outcome(evolved, params)
 
     def scene(self, params: RoverParams) -> RoverScene:
         """The drawing for the frames of an episode."""
@@ -104,32 +95,3 @@ class Rover(ValueIdentity, environment.Environment):
     def name(self) -> str:
         """The name used in messages."""
         return "rover"
-
-    @property
-    def num_actions(self) -> int:
-        """Elements of an action."""
-        return 2
-
-    def action_space(self, params: RoverParams | None = None) -> spaces.Box:
-        """Bounds of (speed m/s, yaw rate rad/s)."""
-        limit = _limits(self.default_params if params is None else params)
-        return spaces.Box(-limit, limit, (2,), jnp.float32)
-
-    def observation_space(self, params: RoverParams | None = None) -> spaces.Box:
-        """(speed error m/s, yaw-rate error rad/s), unbounded."""
-        return spaces.Box(-jnp.inf, jnp.inf, (2,), jnp.float32)
-
-
-def _limits(params: RoverParams) -> jax.Array:
-    """Largest command [2]."""
-    return jnp.stack([float32(params.max_speed), float32(params.max_yaw_rate)])
-
-
-def _errors(state: RoverState, params: RoverParams) -> jax.Array:
-    """Observation [2]: motion minus target."""
-    return jnp.stack(
-        [
-            state.speed - float32(params.target_speed),
-            state.yaw_rate - float32(params.target_yaw_rate),
-        ]
-    )

@@ -1,13 +1,11 @@
 """Registers the rover with its disturbances, baselines, ceiling, drawing and stresses."""
 
-from typing import Any
-
 import jax
 
-from rtd3jax.envs.controllers import PIDPolicy, pid_policy
+from rtd3jax.envs.controllers import PIDPolicy
 from rtd3jax.envs.description import Drawing
-from rtd3jax.envs.interface import describe
 from rtd3jax.envs.registry import register
+from rtd3jax.envs.rover.controllers import constant_command, target_pi
 from rtd3jax.envs.rover.environment import Rover, RoverParams, RoverState
 from rtd3jax.envs.rover.optimum import best_return
 from rtd3jax.envs.rover.slip import Ar1Slip, ConstantSlip, SineSlip
@@ -15,24 +13,14 @@ from rtd3jax.envs.stress import Stress
 from rtd3jax.protocols import EnvironmentLike
 
 
-def constant_command(env: EnvironmentLike) -> tuple[Any, Any]:
-    """The target as a constant command, which is exact without slip; ``env`` may be disturbed."""
-    params = env.default_params
-    params = getattr(params, "env", params)
-    return params.target_speed, params.target_yaw_rate
-
-
 def feedforward_pi(env: EnvironmentLike) -> PIDPolicy | None:
     """Feed-forward of the target, and a PI controller of both errors; None if one is not observed.
 
-    The controller ignores the first observation: the rover is then at rest, which no command has
-    caused. The gains are the best of a grid under ``ar1-slip``, on 1,000 episodes of seed 1000. The
-    gains are high: if observations are delayed or drift, the loop oscillates, and the constant
-    command gives higher returns.
+    The gains are the best of a grid under ``ar1-slip``, on 1,000 episodes of seed 1000. They are
+    high: if observations are delayed or drift, the loop oscillates, and the constant command gives
+    higher returns.
     """
-    if describe(env, env.default_params).observation_size != 2:
-        return None
-    return pid_policy(env, kp=0.1, ki=1.0, feedforward=constant_command(env), ignored=1)
+    return target_pi(env, kp=0.1, ki=1.0)
 
 
 def next_slip(state: RoverState) -> jax.Array | None:

@@ -6,17 +6,12 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from rtd3jax.envs.controllers import PIDPolicy, pid_policy
+from rtd3jax.envs.controllers import PIDPolicy
 from rtd3jax.envs.interface import describe
 from rtd3jax.envs.processes.process import float32
-from rtd3jax.envs.rover_soil.environment import RoverSoilParams, sides
+from rtd3jax.envs.rover.controllers import plain_params, target_pi
+from rtd3jax.envs.rover.task import sides
 from rtd3jax.protocols import EnvironmentLike
-
-
-def constant_command(env: EnvironmentLike) -> tuple[float, float]:
-    """The target itself, which a rover without slip would hold; ``env`` may have faults."""
-    params = plain_params(env)
-    return params.target_speed, params.target_yaw_rate
 
 
 def feedforward_pi(env: EnvironmentLike) -> PIDPolicy | None:
@@ -25,11 +20,7 @@ def feedforward_pi(env: EnvironmentLike) -> PIDPolicy | None:
     The rover's (`rtd3jax.envs.rover.registration`) with other gains: those of
     experiments/rover_soil_gains.py, the best of a grid on 1,000 episodes of seed 1000.
     """
-    if describe(env, env.default_params).observation_size != 2:
-        return None
-    return pid_policy(
-        env, kp=PI_GAINS[0], ki=PI_GAINS[1], feedforward=constant_command(env), ignored=1
-    )
+    return target_pi(env, *PI_GAINS)
 
 
 PI_GAINS = (0.0, 1.6)
@@ -105,9 +96,3 @@ def adaptive_slip(env: EnvironmentLike, gain: float = ESTIMATE_GAIN) -> Adaptive
         target_yaw_rate=float32(params.target_yaw_rate),
         gain=float32(gain),
     )
-
-
-def plain_params(env: EnvironmentLike) -> RoverSoilParams:
-    """The rover's parameters, whether or not ``env`` has faults."""
-    params = env.default_params
-    return getattr(params, "env", params)

@@ -17,11 +17,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from gymnax.environments import environment, spaces
 from jax.typing import ArrayLike
 
-from rtd3jax.envs.identity import ValueIdentity, strong
+from rtd3jax.envs.identity import strong
 from rtd3jax.envs.processes.process import NoDisturbance, Process, float32
+from rtd3jax.envs.rover.slip import WHEELS
+from rtd3jax.envs.rover.task import DrivingTask, errors, limits, sides
 from rtd3jax.envs.rover_soil.field import Ground, GroundState
 from rtd3jax.envs.rover_soil.soil import LocalSoil, Soil, local_soil
 from rtd3jax.envs.rover_soil.wheel import (
@@ -35,7 +36,6 @@ from rtd3jax.envs.rover_soil.wheel import (
 )
 from rtd3jax.errors import UserError
 
-WHEELS = 2
 SUBSTEPS = 4
 """Of the implicit integration within a step."""
 SLOWEST = 0.05
@@ -115,7 +115,7 @@ class Motion(NamedTuple):
     entry: jax.Array
 
 
-class RoverSoil(ValueIdentity, environment.Environment):
+class RoverSoil(DrivingTask):
     """Hold a speed and a yaw rate: actions [2] command them, observations [2] are their errors."""
 
     def __init__(self, default_params: RoverSoilParams | None = None) -> None:
@@ -146,13 +146,13 @@ class RoverSoil(ValueIdentity, environment.Environment):
             heading=zero,
             ground=ground.init(key, params.max_steps_in_episode, WHEELS),
         )
-        return _errors(state, params), strong(state)
+        return errors(state, params), strong(state)
 
     def step_env(
         self, key: jax.Array, state: RoverSoilState, action: ArrayLike, params: RoverSoilParams
     ) -> tuple[jax.Array, RoverSoilState, jax.Array, jax.Array, dict[Any, Any]]:
         """Command ``action`` [2]; the reward [] is that of the motion at the end of the step."""
-        limit = _limits(params)
+        limit = limits(params)
         command = jnp.clip(jnp.asarray(action, jnp.float32), -limit, limit)
         wheelbase = float32(params.wheelbase)
         places = wheel_places(params, state.place, state.heading)
@@ -175,34 +175,12 @@ class RoverSoil(ValueIdentity, environment.Environment):
             heading=state.heading + 0.5 * seconds * (state.yaw_rate + yaw_rate),
             ground=state.ground,
         )
-        observation = _errors(evolved, params)
-        reward = -jnp.sum(observation**2)
-        observation, evolved = self._apply_transition_gradient_policy(observation, strong(evolved))
-        terminated = self.is_terminated(evolved, params)
-        return observation, evolved, reward, terminated, {"true_reward": reward}
-
-    def is_terminated(self, state: RoverSoilState, params: RoverSoilParams) -> jax.Array:
-        """Never: only the time limit ends an episode."""
-        return jnp.zeros((), jnp.bool_)
+        return self.outcome(evolved, params)
 
     @property
     def name(self) -> str:
         """The name used in messages."""
         return "rover-soil"
-
-    @property
-    def num_actions(self) -> int:
-        """Elements of an action."""
-        return 2
-
-    def action_space(self, params: RoverSoilParams | None = None) -> spaces.Box:
-        """Bounds of (speed m/s, yaw rate rad/s)."""
-        limit = _limits(self.default_params if params is None else params)
-        return spaces.Box(-limit, limit, (2,), jnp.float32)
-
-    def observation_space(self, params: RoverSoilParams | None = None) -> spaces.Box:
-        """(speed error m/s, yaw-rate error rad/s), unbounded."""
-        return spaces.Box(-jnp.inf, jnp.inf, (2,), jnp.float32)
 
 
 EVEN = Ground(variation=0.0)
@@ -261,12 +239,6 @@ def wheel_places(params: RoverSoilParams, place: jax.Array, heading: jax.Array) 
     half = 0.5 * float32(params.wheelbase)
     across = half * jnp.stack([-jnp.sin(heading), jnp.cos(heading)])
     return jnp.stack([place + across, place - across])
-
-
-def sides(speed: jax.Array, yaw_rate: jax.Array, wheelbase: jax.Array) -> jax.Array:
-    """Speeds of the left and right side [2]."""
-    turn = 0.5 * wheelbase * yaw_rate
-    return jnp.stack([speed - turn, speed + turn])
 
 
 def slip_of(motion: Motion) -> jax.Array:
@@ -355,18 +327,3 @@ def rolling_of(motion: Motion) -> jax.Array:
 
 def _width(params: RoverSoilParams) -> jax.Array:
     return float32(params.wheel_width)
-
-
-def _limits(params: RoverSoilParams) -> jax.Array:
-    """Largest command [2]."""
-    return jnp.stack([float32(params.max_speed), float32(params.max_yaw_rate)])
-
-
-def _errors(state: RoverSoilState, params: RoverSoilParams) -> jax.Array:
-    """Observation [2]: motion minus target."""
-    return jnp.stack(
-        [
-            state.speed - float32(params.target_speed),
-            state.yaw_rate - float32(params.target_yaw_rate),
-        ]
-    )

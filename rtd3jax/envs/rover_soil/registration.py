@@ -4,7 +4,8 @@ import jax
 
 from rtd3jax.envs.description import Drawing
 from rtd3jax.envs.registry import register
-from rtd3jax.envs.rover_soil.controllers import adaptive_slip, constant_command, feedforward_pi
+from rtd3jax.envs.rover.controllers import constant_command
+from rtd3jax.envs.rover_soil.controllers import adaptive_slip, feedforward_pi
 from rtd3jax.envs.rover_soil.environment import RoverSoil, RoverSoilState
 from rtd3jax.envs.rover_soil.field import Ground
 from rtd3jax.envs.rover_soil.soil import DRY_SAND, REGOLITH

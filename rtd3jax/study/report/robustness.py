@@ -6,44 +6,16 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from rtd3jax.errors import UserError
+from rtd3jax.evaluation.robustness import MEASURED
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.report.data import MEASURES, rows_of
+from rtd3jax.study.report.table import read_table
 from rtd3jax.study.results import CELL, rounded_number
 from rtd3jax.study.statistics import iqm_bands
 
 FILE = "robustness.parquet"
-COLUMNS = (
-    *CELL,
-    "seed",
-    "stress",
-    "quantity",
-    "value",
-    "return",
-    "standard_error",
-    "true_return",
-    "true_standard_error",
-    "episodes",
-)
+COLUMNS = (*CELL, "seed", *MEASURED)
 """One row per lane, stress and value: means over the episodes of a lane."""
-
-
-def read_robustness(path: Path) -> pd.DataFrame | None:
-    """The table; None if there is none.
-
-    Raises:
-        UserError: when the file exists, but is not such a table.
-    """
-    if not path.is_file():
-        return None
-    try:
-        table = pd.read_parquet(path)
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path.name} cannot be read ({str(error).splitlines()[0]})") from error
-    missing = [name for name in COLUMNS if name not in table.columns]
-    if missing:
-        raise UserError(f"{path.name} has no columns {', '.join(missing)}")
-    return table
 
 
 def robustness_data(path: Path, cells: list[Cell]) -> list[dict[str, Any]] | None:
@@ -55,7 +27,7 @@ def robustness_data(path: Path, cells: list[Cell]) -> list[dict[str, Any]] | Non
     Raises:
         UserError: when the file exists, but is not such a table.
     """
-    table = read_robustness(path)
+    table = read_table(path, COLUMNS)
     if table is None:
         return None
     return [

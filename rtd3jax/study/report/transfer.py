@@ -4,10 +4,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
-from rtd3jax.errors import UserError
 from rtd3jax.study.report.data import summary_data
+from rtd3jax.study.report.table import read_table
 from rtd3jax.study.statistics import summarise
 
 FILE = "transfer.parquet"
@@ -22,15 +21,9 @@ def transfer_data(path: Path) -> list[dict[str, Any]] | None:
     Raises:
         UserError: when the file exists, but is not such a table.
     """
-    if not path.is_file():
+    table = read_table(path, COLUMNS)
+    if table is None:
         return None
-    try:
-        table = pd.read_parquet(path)
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path.name} cannot be read ({str(error).splitlines()[0]})") from error
-    missing = [name for name in COLUMNS if name not in table.columns]
-    if missing:
-        raise UserError(f"{path.name} has no columns {', '.join(missing)}")
     table = table.astype({"return": np.float64})
     seeds = table.groupby([*_CELL, "seed"], sort=False)["return"]
     # As in `seed_means`: a lane with a NaN episode has no mean.

@@ -1,0 +1,81 @@
+"""The task of a rover, whatever its wheels meet: hold a speed and a yaw rate (paper, Section 8.2).
+
+Units: m, s, rad. The left wheel comes first. Other rovers inherit from `DrivingTask`, so that the
+policies of one act in the others.
+"""
+
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+from gymnax.environments import environment, spaces
+
+from rtd3jax.envs.identity import ValueIdentity, strong
+from rtd3jax.envs.processes.process import float32
+
+
+class TaskParams(Protocol):
+    """What the task reads of a rover's parameters."""
+
+    target_speed: float
+    target_yaw_rate: float
+    max_speed: float
+    max_yaw_rate: float
+
+
+class MotionState(Protocol):
+    """What the task reads of a rover's state."""
+
+    speed: jax.Array
+    yaw_rate: jax.Array
+
+
+class DrivingTask(ValueIdentity, environment.Environment):
+    """Task: hold a speed and a yaw rate. Actions [2] command them; observations [2] are errors."""
+
+    def outcome(self, evolved: Any, params: Any) -> tuple[Any, Any, jax.Array, jax.Array, dict]:
+        """What ``step_env`` returns for the state after it; the reward [] is that of its motion."""
+        observation = errors(evolved, params)
+        reward = -jnp.sum(observation**2)
+        observation, evolved = self._apply_transition_gradient_policy(observation, strong(evolved))
+        terminated = self.is_terminated(evolved, params)
+        return observation, evolved, reward, terminated, {"true_reward": reward}
+
+    def is_terminated(self, state: object, params: object) -> jax.Array:
+        """Always false: only the time limit ends an episode."""
+        return jnp.zeros((), jnp.bool_)
+
+    @property
+    def num_actions(self) -> int:
+        """Elements of an action."""
+        return 2
+
+    def action_space(self, params: TaskParams | None = None) -> spaces.Box:
+        """Bounds of (speed m/s, yaw rate rad/s)."""
+        limit = limits(self.default_params if params is None else params)
+        return spaces.Box(-limit, limit, (2,), jnp.float32)
+
+    def observation_space(self, params: TaskParams | None = None) -> spaces.Box:
+        """(speed error m/s, yaw-rate error rad/s), unbounded."""
+        return spaces.Box(-jnp.inf, jnp.inf, (2,), jnp.float32)
+
+
+def limits(params: TaskParams) -> jax.Array:
+    """Largest command [2]."""
+    return jnp.stack([float32(params.max_speed), float32(params.max_yaw_rate)])
+
+
+def sides(speed: jax.Array, yaw_rate: jax.Array, wheelbase: jax.Array) -> jax.Array:
+    """Speeds of the left and right side [2]."""
+    turn = 0.5 * wheelbase * yaw_rate
+    return jnp.stack([speed - turn, speed + turn])
+
+
+def errors(state: MotionState, params: TaskParams) -> jax.Array:
+    """Observation [2]: motion minus target."""
+    return jnp.stack(
+        [
+            state.speed - float32(params.target_speed),
+            state.yaw_rate - float32(params.target_yaw_rate),
+        ]
+    )
