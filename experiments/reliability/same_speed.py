@@ -1,13 +1,18 @@
-"""Compares the speed of two checkouts: whole training steps, and compilation.
+"""Compares the speed of two checkouts, or of the loop with and without its metrics of learning.
 
 Usage: python experiments/reliability/same_speed.py OTHER [--quick] [--agents A ...]
                                                     [--lengths L ...] [--rounds N] [--seconds S]
+                                                    [--processes N]
+       python experiments/reliability/same_speed.py --metrics [...]
 
 OTHER is the directory of another checkout, for example of `git worktree add /tmp/other COMMIT`.
-Each checkout has its own process, with the lanes of the benchmark: one for each core, width 128,
-batch 100, on the rover. They are measured alternately, and each ratio is computed from measurements
-that follow each other. The table has the median and the quartiles of the time here divided by the
-time there. The compilation is measured once, without JAX's persistent cache.
+With `--metrics`, the other side is this checkout without the code that collects metrics. Each side
+has its own process, with the lanes of the benchmark: one for each core, width 128, batch 100, on
+the rover. The sides are measured alternately, and each ratio is computed from measurements that
+follow each other. The rounds are divided over several pairs of processes, whose speeds differ by up
+to 1% because of the places of their arrays in memory. The table has the median of the time here
+divided by the time there, its 95% interval from a bootstrap over the pairs, and the same of the
+compilation, which happens without JAX's persistent cache.
 """
 
 import argparse
@@ -25,6 +30,9 @@ import sys
 import jax
 from experiments.benchmarks.ours import Lanes, make_config
 agent, length, size, seconds = sys.argv[1], *map(int, sys.argv[2:4]), float(sys.argv[4])
+if sys.argv[5] == "without-metrics":
+    from rtd3jax.training import loop
+    loop.note_update = loop.note_reward = loop.averaged = lambda averages, *_: averages
 jax.devices()
 lanes = Lanes(make_config(agent, length, hidden_size=size, batch_size=min(100, 10 * size)), 2)
 print(lanes.warm_up(seconds), flush=True)
@@ -73,35 +81,54 @@ class Worker:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("other", type=pathlib.Path)
+    parser.add_argument("other", type=pathlib.Path, nargs="?")
+    parser.add_argument("--metrics", action="store_true", help="compare with no metrics, here")
     parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
     parser.add_argument("--agents", nargs="+", default=["lstm-td3-1ha1hc", "td3", "h-td3"])
     parser.add_argument("--lengths", nargs="+", type=int, default=[1, 20])
     parser.add_argument("--rounds", type=int, default=11)
     parser.add_argument("--seconds", type=float, default=1.5)
+    parser.add_argument("--processes", type=int, default=7, help="pairs")
     options = parser.parse_args(arguments)
+    if (options.other is None) != options.metrics:
+        parser.error("give either another checkout or --metrics")
     size = 128
     if options.quick:
         options.agents, options.lengths, options.rounds, options.seconds = ["td3"], [1], 2, 0.05
-        size = 8
-    print("| agent | l | a step: here / there | quartiles | compiling: here / there |")
-    print("|---|---|---|---|---|")
+        size, options.processes = 8, 2
+    checkouts = (options.other or HERE).resolve(), HERE
+    kinds = ("without-metrics" if options.metrics else "all", "all")
+    print("| agent | l | a step: here / there | 95% interval | compiling | 95% interval |")
+    print("|---|---|---|---|---|---|")
     for agent in options.agents:
         for length in options.lengths if agent != "td3" else [0]:
             asked = [agent, str(length), str(size), str(options.seconds)]
-            checkouts = options.other.resolve(), HERE
-            workers = [Worker(checkout, asked) for checkout in checkouts]
-            ratios = []
-            for _ in range(options.rounds):
-                there, here = (worker.step() for worker in workers)
-                ratios.append(here / there)
-            for worker in workers:
-                worker.end()
-            low, middle, high = np.quantile(ratios, [0.25, 0.5, 0.75])
-            compiling = workers[1].compiling / workers[0].compiling
-            step = f"{middle:.3f} | {low:.3f} to {high:.3f}"
-            print(f"| {agent} | {length} | {step} | {compiling:.2f} |", flush=True)
+            sides = [
+                (checkout, [*asked, kind]) for checkout, kind in zip(checkouts, kinds, strict=True)
+            ]
+            compiling, ratios = [], []
+            for _ in range(options.processes):
+                workers = [Worker(*side) for side in sides]
+                compiling.append([workers[1].compiling / workers[0].compiling])
+                ratios.append([])
+                for number in range(-(-options.rounds // options.processes)):
+                    # In both orders, so that neither side always follows the other.
+                    order = workers if number % 2 else workers[::-1]
+                    taken = {id(worker): worker.step() for worker in order}
+                    ratios[-1].append(taken[id(workers[1])] / taken[id(workers[0])])
+                for worker in workers:
+                    worker.end()
+            columns = [agent, str(length), *_median(ratios), *_median(compiling)]
+            print(f"| {' | '.join(columns)} |", flush=True)
     return 0
+
+
+def _median(ratios: list[list[float]]) -> tuple[str, str]:
+    """The median of all ratios, and its 95% interval from a bootstrap over the pairs."""
+    table, random = np.array(ratios), np.random.default_rng(0)
+    draws = table[random.integers(len(table), size=(4_000, len(table)))]
+    low, high = np.quantile(np.median(draws, axis=(1, 2)), [0.025, 0.975])
+    return f"{np.median(table):.3f}", f"{low:.3f} to {high:.3f}"
 
 
 if __name__ == "__main__":

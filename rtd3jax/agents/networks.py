@@ -15,6 +15,7 @@ import jax.numpy as jnp
 
 from rtd3jax.agents.history import History, Segment, Steps, Window, flat
 from rtd3jax.agents.memory.base import Carry, Memory, Params, check_memory
+from rtd3jax.agents.parameters import own_parameters
 from rtd3jax.agents.products import matmul
 from rtd3jax.errors import UserError, first_line
 from rtd3jax.registries import MEMORIES
@@ -56,8 +57,8 @@ class Linear(nn.Module):
     precision: str | None = None
 
     def setup(self) -> None:
-        self.kernel = self.param("kernel", lambda key: self.initial(key)["kernel"])
-        self.bias = self.param("bias", lambda key: self.initial(key)["bias"])
+        own = own_parameters(self, ("kernel", "bias"))
+        self.kernel, self.bias = own["kernel"], own["bias"]
 
     def initial(self, key: jax.Array) -> Params:
         """Initial parameters, uniform in ±1/sqrt(inputs)."""

@@ -80,10 +80,17 @@ def test_a_run_has_the_metrics_of_each_interval():
 
 
 def test_the_actors_norm_is_that_of_its_gradient():
-    from rtd3jax.agents.learners.td3 import _norm_from_moments
+    from rtd3jax.agents.learners.td3 import _as_measured, _norm
 
-    before, gradient = {"a": jnp.array([1.0, -2.0])}, {"a": jnp.array([3.0, 4.0])}
+    gradient = {
+        "memory": {"input_kernel": jnp.array([[2.0]]), "recurrent_kernel": jnp.array([[4.0]])},
+        "head": {"bias": jnp.array([1.0, -2.0])},
+    }
+    before = jax.tree.map(lambda g: 7.0 - g, gradient)
     after = jax.tree.map(lambda m, g: 0.9 * m + 0.1 * g, before, gradient)
-    found = _norm_from_moments(jnp.asarray(True), before, after)
+    # Only the gradient of the recurrent kernel may be read from the gradient itself.
+    readable = jax.tree.map(jnp.zeros_like, gradient)
+    readable["memory"]["recurrent_kernel"] = gradient["memory"]["recurrent_kernel"]
+    found = _norm(jnp.asarray(True), _as_measured(readable, before, after))
     np.testing.assert_allclose(found.total, 5.0, rtol=1e-5)
-    assert float(_norm_from_moments(jnp.asarray(False), before, after).times) == 0.0
+    assert float(_norm(jnp.asarray(False), gradient).times) == 0.0

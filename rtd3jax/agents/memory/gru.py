@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from rtd3jax.agents.memory.base import Memory, Params, draw_uniform
+from rtd3jax.agents.parameters import own_parameters
 from rtd3jax.agents.products import matmul
 
 
@@ -16,9 +17,7 @@ class GRU(Memory):
 
     def setup(self) -> None:
         names = ("input_kernel", "recurrent_kernel", "input_bias", "recurrent_bias")
-        self.kernels = {
-            name: self.param(name, lambda key, name=name: self.initial(key)[name]) for name in names
-        }
+        self.kernels = own_parameters(self, names)
 
     def initial(self, key: jax.Array) -> Params:
         """Uniform in ±1/sqrt(H)."""

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from rtd3jax.agents.memory.base import Memory, draw_uniform
+from rtd3jax.agents.parameters import own_parameters
 from rtd3jax.agents.products import matmul, narrow, product, weight_gradient
 
 Params = dict[str, jax.Array]
@@ -53,10 +54,7 @@ class LSTM(Memory):
 
     def setup(self) -> None:
         # The names are those in files; `initial` draws all parameters from one key.
-        self.kernels = {
-            name: self.param(name, lambda key, name=name: self.initial(key)[name])
-            for name in _ARRAYS
-        }
+        self.kernels = own_parameters(self, _ARRAYS)
 
     def initial(self, key: jax.Array) -> Params:
         """Uniform in ±1/sqrt(H)."""

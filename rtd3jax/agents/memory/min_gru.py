@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from rtd3jax.agents.memory.base import Memory, Params, draw_uniform
+from rtd3jax.agents.parameters import own_parameters
 from rtd3jax.agents.products import matmul
 
 
@@ -17,10 +18,7 @@ class MinGRU(Memory):
     """A minimal GRU; gate order: gate, candidate. The carry [B, H] is the output."""
 
     def setup(self) -> None:
-        self.kernels = {
-            name: self.param(name, lambda key, name=name: self.initial(key)[name])
-            for name in ("kernel", "bias")
-        }
+        self.kernels = own_parameters(self, ("kernel", "bias"))
 
     def initial(self, key: jax.Array) -> Params:
         """Uniform in ±1/sqrt(I)."""
