@@ -57,6 +57,10 @@ BASE = {
     "normalise_observations": False,
 }
 LONGER = {"total_steps": 60_000}
+PRIVILEGED = {"algorithm": "lstm-td3-privileged"}
+"""Its critics read the undisturbed observation; the policy does not."""
+FOUR = "random-sine/temporal-sine/temporal-bias/noise:weights=(1,1,1,3)"
+FIVE = "random-sine/temporal-sine/combined-sine/temporal-bias/noise"
 CHANGES: tuple[dict, ...] = (
     {},
     {"disturbance": f"{MIXTURE}:weights=(1,1,1,1,4)"},
@@ -67,6 +71,23 @@ CHANGES: tuple[dict, ...] = (
     LONGER,
     {"history_length": 40},
     {"hidden_size": 128},
+    PRIVILEGED,
+    {**PRIVILEGED, "disturbance": "noise:reward_from=state"},
+    {
+        **PRIVILEGED,
+        "disturbance": f"{FIVE}:weights=(2,2,3,1,5)",
+        "total_steps": 120_000,
+        "update_every": 1,
+    },
+    {
+        **PRIVILEGED,
+        "disturbance": f"{FIVE}:weights=(1,1,1,1,2)",
+        "total_steps": 120_000,
+        "history_length": 40,
+    },
+    {**PRIVILEGED, **LONGER, "disturbance": FOUR, "update_every": 1},
+    {**PRIVILEGED, **LONGER, "disturbance": FOUR, "history_length": 40},
+    {**PRIVILEGED, **LONGER, "disturbance": FOUR, "hidden_size": 128},
 )
 """What each setting changes in `BASE`."""
 

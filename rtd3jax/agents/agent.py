@@ -28,6 +28,7 @@ from rtd3jax.agents.normalise import Normaliser, Statistics, no_statistics, norm
 from rtd3jax.agents.replay import Batch, Replay, empty_replay, sample, sample_segments
 from rtd3jax.agents.variants import Variant
 from rtd3jax.config import Config
+from rtd3jax.errors import UserError
 from rtd3jax.registries import AGENTS, LEARNERS, MEMORIES
 
 
@@ -42,6 +43,10 @@ class Sizes(Protocol):
     def action_size(self) -> int:
         """A."""
 
+    @property
+    def true_observation_size(self) -> int:
+        """S: elements of the undisturbed observation; 0 if the environment does not tell it."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Agent:
@@ -55,6 +60,7 @@ class Agent:
         config: the configuration.
         observation_size: O.
         action_size: A.
+        true_observation_size: S; 0 if the environment does not tell the undisturbed observation.
     """
 
     variant: Variant
@@ -64,6 +70,7 @@ class Agent:
     config: Config
     observation_size: int
     action_size: int
+    true_observation_size: int
 
     @property
     def metrics(self) -> tuple[str, ...]:
@@ -90,6 +97,11 @@ class Agent:
         from_carries = self.has_running_carry and self.config.replay == "segments"
         return self.variant.stores_carry or from_carries
 
+    @property
+    def reads_truth(self) -> bool:
+        """Whether the critics read the undisturbed observation, which the replay then stores."""
+        return self.variant.reads_truth
+
     def empty_replay(self) -> Replay:
         """An empty ring buffer for the agent's transitions."""
         carry = self.acting.zero_carry(1) if self.stores_carry else None
@@ -99,6 +111,7 @@ class Agent:
             self.action_size,
             carry,
             self.config.environments,
+            self.true_observation_size if self.reads_truth else 0,
         )
 
     def zero_carry(self) -> Carry | None:
@@ -209,8 +222,15 @@ def make_agent(config: Config, interface: Sizes) -> Agent:
     """
     variant: Variant = AGENTS[config.algorithm]
     sizes = interface.observation_size, interface.action_size, config.hidden_size
+    truth = interface.true_observation_size
+    if variant.reads_truth and not truth:
+        raise UserError(
+            f"agent {config.algorithm!r}: its critics read the undisturbed observation, which the "
+            "environment does not tell: disturb it with rtd.disturb, or give it a method "
+            "true_observation(state, params) and step's info['true_observation']"
+        )
     actor, critic = (
-        make_part(variant, role, config.memory, *sizes, config.precision)
+        make_part(variant, role, config.memory, *sizes, config.precision, truth)
         for role in ("actor", "critic")
     )
     check_parts(config.frozen, {"actor": actor, "critics": critic})
@@ -222,6 +242,7 @@ def make_agent(config: Config, interface: Sizes) -> Agent:
         config=config,
         observation_size=interface.observation_size,
         action_size=interface.action_size,
+        true_observation_size=truth,
     )
 
 
@@ -233,6 +254,7 @@ def make_part(
     action_size: int,
     width: int,
     precision: str = "float32",
+    true_observation_size: int | None = None,
 ) -> Network:
     """An agent's ``actor`` or ``critic``.
 
@@ -244,10 +266,11 @@ def make_part(
         action_size: A.
         width: width H of every layer.
         precision: precision of the factors of large products.
+        true_observation_size: S; O by default.
     """
     # The class is part of the key, so that a memory that replaced another takes effect.
     sizes = observation_size, action_size, width
-    return _part(variant, role, memory, MEMORIES[memory], *sizes, precision)
+    return _part(variant, role, memory, MEMORIES[memory], *sizes, precision, true_observation_size)
 
 
 def count_parameters(
@@ -281,11 +304,12 @@ def _part(
     action_size: int,
     width: int,
     precision: str,
+    true_observation_size: int | None,
 ) -> Network:
     return make_network(
         getattr(variant, role),
         memory,
-        part_sizes(observation_size, action_size),
+        part_sizes(observation_size, action_size, true_observation_size),
         width,
         action_size if role == "actor" else 1,
         precision,

@@ -13,6 +13,7 @@ Shapes: ``C`` capacity of the ring, ``L`` past tokens, ``B`` batch, ``M`` segmen
 ``O`` and ``A`` sizes of an observation and an action.
 """
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -44,12 +45,14 @@ class Window:
         length: int32 [B], the number of existing past tokens, which are the last ones.
         observation: [B, O], the current observation.
         previous_action: [B, A], the action before it; zero at an episode's first step.
+        true_observation: [B, S], the undisturbed observation, for critics that read it; else None.
     """
 
     past: Steps
     length: jax.Array
     observation: jax.Array
     previous_action: jax.Array
+    true_observation: jax.Array | None = None
 
     @property
     def exists(self) -> jax.Array:
@@ -77,6 +80,7 @@ class Segment:
             Kapturowski et al., 2019). None if histories start with a zero carry.
         following: whether the current step is the step after each of the m steps.
         burn_in_gradient: whether gradients flow into the burn-in.
+        true_observation: [B, S], as in `Window`.
     """
 
     steps: Steps
@@ -87,6 +91,7 @@ class Segment:
     start: Any
     following: bool = struct.field(pytree_node=False)
     burn_in_gradient: bool = struct.field(pytree_node=False)
+    true_observation: jax.Array | None = None
 
     @property
     def length(self) -> int:
@@ -101,7 +106,8 @@ class Segment:
     @property
     def present(self) -> Window:
         """The current step only: a window without past tokens."""
-        return present(self.observation, self.previous_action)
+        window = present(self.observation, self.previous_action)
+        return dataclasses.replace(window, true_observation=self.true_observation)
 
 
 History = Window | Segment

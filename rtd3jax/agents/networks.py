@@ -194,7 +194,7 @@ def make_network(
     Args:
         reads: the inputs of the network.
         memory: the registered name of the memory.
-        sizes: elements of each part: ``observation``, ``action``, ``previous_action``.
+        sizes: elements of each part, from `part_sizes`.
         width: H.
         outputs: elements of the output: A for an actor, 1 for a critic.
         precision: precision of the factors of large products; see `rtd3jax.agents.products`.
@@ -347,12 +347,15 @@ def _output(network: Network, params: Params, *inputs: Any, method: str | None =
     return output
 
 
-def part_sizes(observation_size: int, action_size: int) -> dict[str, int]:
-    """Number of elements of each part of a token."""
+def part_sizes(
+    observation_size: int, action_size: int, true_observation_size: int | None = None
+) -> dict[str, int]:
+    """Number of elements of each part of a token; without ``true_observation_size``, S = O."""
     return {
         "observation": observation_size,
         "action": action_size,
         "previous_action": action_size,
+        "true_observation": true_observation_size or observation_size,
     }
 
 
@@ -367,6 +370,7 @@ def current_token(parts: tuple[str, ...], window: Window, action: jax.Array | No
         "observation": window.observation,
         "previous_action": window.previous_action,
         "action": action,
+        "true_observation": window.true_observation,
     }
     return jnp.concatenate([values[part] for part in parts], axis=-1)
 

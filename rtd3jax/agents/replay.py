@@ -39,6 +39,7 @@ class Transition:
         next_observation: [O]; at the end of an episode, the final observation of this episode.
         terminated: bool []; no bootstrapping after it. A time limit is not a termination.
         episode_step: int32 [], number of earlier steps of the same episode; it limits the window.
+        truth: the undisturbed observations, for critics that read them; else None.
     """
 
     step: Steps
@@ -46,6 +47,20 @@ class Transition:
     next_observation: jax.Array
     terminated: jax.Array
     episode_step: jax.Array
+    truth: "Truth | None" = None
+
+
+@struct.dataclass
+class Truth:
+    """Undisturbed observations of a transition.
+
+    Attributes:
+        observation: [S], at the step.
+        next_observation: [S], after it; at the end of an episode, of the final observation.
+    """
+
+    observation: jax.Array
+    next_observation: jax.Array
 
 
 @struct.dataclass
@@ -94,14 +109,21 @@ def empty_replay(
     action_size: int,
     carry: Carry | None,
     environments: int = 1,
+    true_observation_size: int = 0,
 ) -> Replay:
-    """A ring of ``capacity`` rows; it stores carries like ``carry`` [1, ...] unless None."""
+    """A ring of ``capacity`` rows; it stores carries like ``carry`` [1, ...] unless None.
+
+    It stores undisturbed observations of ``true_observation_size`` elements, unless this is 0.
+    """
+    size = true_observation_size
+    truths = (jnp.zeros((capacity, size), jnp.float32) for _ in range(2))
     transitions = Transition(
         step=empty_steps(capacity, observation_size, action_size),
         reward=jnp.zeros((capacity,), jnp.float32),
         next_observation=jnp.zeros((capacity, observation_size), jnp.float32),
         terminated=jnp.zeros((capacity,), bool),
         episode_step=jnp.zeros((capacity,), jnp.int32),
+        truth=Truth(*truths) if size else None,
     )
     carries = jax.tree.map(
         lambda leaf: jnp.zeros((capacity + environments, *leaf.shape[1:]), jnp.float32), carry
@@ -280,7 +302,7 @@ def gather(
     )
     action = kept.step.action[slot]
     carry, next_carry = _stored_carries(replay, step_number, episode_step)
-    return Batch(
+    batch = Batch(
         window=window,
         action=action,
         reward=kept.reward[slot],
@@ -288,6 +310,19 @@ def gather(
         next_window=next_window(window, action, kept.next_observation[slot], history_length),
         carry=carry,
         next_carry=next_carry,
+    )
+    return _with_truth(batch, kept.truth, slot)
+
+
+def _with_truth(batch: Batch, truth: Truth | None, slot: jax.Array) -> Batch:
+    """``batch``, with the undisturbed observations in ``slot`` [B], if the ring stores them."""
+    if truth is None:
+        return batch
+    rows = jax.tree.map(lambda kept: kept[slot], truth)
+    return dataclasses.replace(
+        batch,
+        window=dataclasses.replace(batch.window, true_observation=rows.observation),
+        next_window=dataclasses.replace(batch.next_window, true_observation=rows.next_observation),
     )
 
 
@@ -373,7 +408,7 @@ def gather_segments(
         previous_action=action,
         following=True,
     )
-    return Batch(
+    batch = Batch(
         window=segment,
         action=action,
         reward=kept.reward[slot],
@@ -382,6 +417,7 @@ def gather_segments(
         carry=carry,
         next_carry=next_carry,
     )
+    return _with_truth(batch, kept.truth, slot)
 
 
 def _stored_carries(

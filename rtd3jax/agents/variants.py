@@ -49,11 +49,18 @@ class Variant:
         """Whether the replay stores the behaviour actor's carries."""
         return self.critic.carry_from_replay
 
+    @property
+    def reads_truth(self) -> bool:
+        """Whether the critics read the undisturbed observation (a privileged critic)."""
+        return _T in self.critic.current
+
 
 _O = "observation"
 _A = "action"
 _P = "previous_action"
-PARTS = (_O, _A, _P)
+_T = "true_observation"
+PARTS = (_O, _A, _P, _T)
+"""Parts of tokens; only the current stream of critics may read the true observation."""
 
 _ONE_HEADED_ACTOR = NetworkSpec(memory=(_O, _P), memory_has_current=True)
 
@@ -103,6 +110,17 @@ _PAPER: dict[str, Variant] = {
 ALGORITHMS = tuple(_PAPER)
 """The six agents of the paper."""
 
+_BEYOND: dict[str, Variant] = {
+    # An asymmetric actor-critic (Pinto et al., 2018): in simulation, the critics may read what the
+    # actor must infer. The policy never reads it.
+    "lstm-td3-privileged": Variant(
+        actor=_ONE_HEADED_ACTOR,
+        critic=NetworkSpec(current=(_T, _P, _A)),
+        colour="#56B4E9",
+        peak_arrays=22.5,
+    ),
+}
+
 
 def register_agent(name: str, variant: Variant, *, replace: bool = False) -> None:
     """Register an agent, for ``Config(algorithm=name)``.
@@ -133,6 +151,11 @@ def _check(name: str, variant: Variant) -> None:
                 raise UserError(
                     f"agent {name!r}: its {role} reads {part!r}; the parts are {', '.join(PARTS)}"
                 )
+    if _T in (*actor.memory, *actor.current, *critic.memory):
+        raise UserError(
+            f"agent {name!r}: {_T!r} is for the current stream of critics only: it is unknown when "
+            "a policy acts"
+        )
     if _A in actor.current or (_A in actor.memory and actor.memory_has_current):
         raise UserError(
             f"agent {name!r}: its actor reads the action that it must choose; use "
@@ -147,5 +170,5 @@ def _check(name: str, variant: Variant) -> None:
         )
 
 
-for _name, _variant in _PAPER.items():
+for _name, _variant in (_PAPER | _BEYOND).items():
     register_agent(_name, _variant)

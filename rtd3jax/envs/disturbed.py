@@ -65,6 +65,8 @@ class DisturbedState(struct.PyTreeNode):
     """state of the reward's process, drawn at the start of each episode"""
     observation: jax.Array
     """float32 [O]: the last observation that the agent received"""
+    true_observation: jax.Array
+    """float32 [S]: the same observation, undisturbed"""
 
 
 class Disturbed(ValueIdentity, environment.Environment):
@@ -176,6 +178,7 @@ class Disturbed(ValueIdentity, environment.Environment):
             ),
             reward=params.reward.init(jax.random.fold_in(key_init, _REWARD_STREAM), horizon, 1),
             observation=observation,
+            true_observation=true_observation,
         )
         return observation, strong(state)
 
@@ -210,6 +213,7 @@ class Disturbed(ValueIdentity, environment.Environment):
             action=action_state,
             reward=reward_state,
             observation=observation,
+            true_observation=true_observation,
         )
         info = {
             **info,
@@ -217,6 +221,10 @@ class Disturbed(ValueIdentity, environment.Environment):
             "true_observation": true_observation,
         }
         return observation, strong(evolved), reward.reshape(()), terminated, info
+
+    def true_observation(self, state: DisturbedState, params: object = None) -> jax.Array:
+        """The undisturbed observation [S] of a state."""
+        return state.true_observation
 
     def is_terminated(self, state: DisturbedState, params: DisturbedParams) -> jax.Array:
         """Whether the wrapped environment terminated."""

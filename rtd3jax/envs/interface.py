@@ -29,6 +29,8 @@ class Interface:
     """float32 [A]"""
     action_high: np.ndarray
     """float32 [A]"""
+    true_observation_size: int = 0
+    """S; 0 if the environment does not tell the undisturbed observation"""
 
     @property
     def sizes(self) -> tuple[int, int]:
@@ -103,7 +105,15 @@ def survey(env: EnvironmentLike, params: object) -> Survey:
         return Survey(None, problems, first, None)
     problems += _step_problems(name, after, first[0])
     size = first[0].shape[0]
-    return Survey(Interface(size, shape, low.size, low, high), problems, first, after)
+    truth = _true_observation_size(env, after[5])
+    return Survey(Interface(size, shape, low.size, low, high, truth), problems, first, after)
+
+
+def _true_observation_size(env: object, info: object) -> int:
+    """S, if the environment tells the undisturbed observation of a state and in info; else 0."""
+    told = info.get("true_observation") if isinstance(info, dict) else None
+    shape: tuple[int, ...] = getattr(told, "shape", ())
+    return shape[0] if hasattr(env, "true_observation") and len(shape) == 1 else 0
 
 
 def trace_reset(env: EnvironmentLike, params: object) -> tuple[Any, Any]:

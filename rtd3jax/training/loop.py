@@ -25,6 +25,7 @@ from rtd3jax.agents.normalise import Normaliser, Statistics, as_read, normalised
 from rtd3jax.agents.replay import (
     Replay,
     Transition,
+    Truth,
     keep_acting_carry,
     present_window,
     store,
@@ -110,12 +111,14 @@ class Program:
         config: the configuration with traced fields at their defaults; see `make_program`.
         observation_size: O.
         action_shape: shape of the environment's action.
+        true_observation_size: S; 0 if the environment does not tell the undisturbed observation.
     """
 
     env: EnvironmentLike
     config: Config
     observation_size: int
     action_shape: tuple[int, ...]
+    true_observation_size: int = 0
 
     @functools.cached_property
     def agent(self) -> Agent:
@@ -224,10 +227,13 @@ class Program:
             state.learner, replay, normaliser, state.metrics, learn_key, hyperparameters, step
         )
 
-        observation, env_state, reward, terminated, truncated, final_observation = self._transit(
+        observation, env_state, reward, terminated, truncated, info = self._transit(
             env_key, state.env_state, action, lane
         )
-        final_observation = final_observation.astype(jnp.float32)
+        final_observation = info["final_observation"].astype(jnp.float32)
+        truth = None
+        if self.agent.reads_truth:
+            truth = Truth(self._truth(state.env_state, lane), info["true_observation"])
         reward = reward.astype(jnp.float32)
         done = terminated.astype(bool) | truncated.astype(bool)
 
@@ -240,6 +246,7 @@ class Program:
                 next_observation=final_observation,
                 terminated=terminated.astype(bool),
                 episode_step=state.episode_step,
+                truth=truth,
             ),
             done,
             final_carry=lambda: self.agent.final_carry(
@@ -284,27 +291,37 @@ class Program:
 
     def _transit(
         self, key: jax.Array, env_state: Any, action: jax.Array, lane: Lane
-    ) -> tuple[jax.Array, Any, jax.Array, jax.Array, jax.Array, jax.Array]:
+    ) -> tuple[jax.Array, Any, jax.Array, jax.Array, jax.Array, dict[str, jax.Array]]:
         """A step of each environment with its ``action`` [E, A].
 
         Returns:
             The next observations [E, O], the state, rewards, terminations and truncations [E], and
-            the observations [E, O] before automatic resets, which are final ones at the end of an
-            episode.
+            those entries of info that are needed: the observations [E, O] before automatic resets,
+            which are final ones at the end of an episode, and these without disturbances, [E, S],
+            if the critics read them.
         """
+        wanted = ("final_observation", *["true_observation"] * self.agent.reads_truth)
         bounds = self.bounds(lane)
 
         def step(key: jax.Array, env_state: Any, action: jax.Array) -> tuple[Any, ...]:
             command = bounds.to_environment(action).reshape(self.action_shape)
             *found, info = self.env.step(key, env_state, command, lane.env_params)
-            return *found, info["final_observation"]
+            return *found, {name: info[name] for name in wanted}
 
         with foreign_code():
             if self.config.environments == 1:
                 observation, env_state, *rest = step(key, env_state, action[0])
-                return observation[None], env_state, *(leaf[None] for leaf in rest)
+                return observation[None], env_state, *jax.tree.map(lambda leaf: leaf[None], rest)
             keys = jax.random.split(key, self.config.environments)
             return jax.vmap(step)(keys, env_state, action)
+
+    def _truth(self, env_state: Any, lane: Lane) -> jax.Array:
+        """The undisturbed observations [E, S] of the environments' states."""
+        env: Any = self.env
+        with foreign_code():
+            if self.config.environments == 1:
+                return env.true_observation(env_state, lane.env_params)[None]
+            return jax.vmap(env.true_observation, (0, None))(env_state, lane.env_params)
 
     def _explore(
         self, greedy: jax.Array, key: jax.Array, hyperparameters: Hyperparameters, step: jax.Array
@@ -428,6 +445,7 @@ def make_program(
     observation_size: int,
     action_shape: tuple[int, ...],
     window: int | None = None,
+    true_observation_size: int = 0,
 ) -> Program:
     """The program of lanes that only differ in traced numbers.
 
@@ -439,7 +457,7 @@ def make_program(
     static = dataclasses.replace(config, **defaults, start=config.start and "trained")
     if window is not None and config.has_window and config.replay == "windows":
         static = dataclasses.replace(static, history_length=window)
-    return Program(env, static, observation_size, action_shape)
+    return Program(env, static, observation_size, action_shape, true_observation_size)
 
 
 def make_lane(config: Config, seed: int, env_params: object) -> Lane:

@@ -271,7 +271,15 @@ def make_jobs(
     warn_if_untrained(config)
     check_segments(config, _horizon(params))
     interface = describe(env, params)
-    program = make_program(env, config, interface.observation_size, interface.action_shape, window)
+    program = make_program(
+        env,
+        config,
+        interface.observation_size,
+        interface.action_shape,
+        window,
+        interface.true_observation_size,
+    )
+    _ = program.agent  # raises UserError, before anything is compiled or written
     starts = starts or {}
     return [
         Job(program, make_lane(config, seed, params), cell, seed, starts.get(seed))
