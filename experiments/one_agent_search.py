@@ -75,6 +75,12 @@ CHANGES: tuple[dict, ...] = (
     {**PRIVILEGED, "disturbance": "noise:reward_from=state"},
     {
         **PRIVILEGED,
+        "disturbance": "noise:reward_from=state",
+        "total_steps": 120_000,
+        "history_length": 40,
+    },
+    {
+        **PRIVILEGED,
         "disturbance": f"{FIVE}:weights=(2,2,3,1,5)",
         "total_steps": 120_000,
         "update_every": 1,

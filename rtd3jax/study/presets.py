@@ -54,6 +54,23 @@ PENDULUM_OWN_SETTINGS: dict[str, dict[str, Any]] = {
 }
 """Settings of h-td3, whose critics read carries that an old version of the actor stored."""
 
+ROBUST_AGENT = "lstm-td3-privileged"
+ROBUST_DISTURBANCE = (
+    "random-sine/temporal-sine/combined-sine/temporal-bias/noise:weights=(1,1,1,1,2)"
+)
+ROBUST_HISTORY_LENGTH = 40
+ROBUST_SETTINGS: dict[str, Any] = {
+    **PENDULUM_SETTINGS,
+    "batch_size": 100,
+    "hidden_size": 64,
+    "replay": "segments",
+    "segment_length": 10,
+    "burn_in_gradient": False,
+    "total_steps": 120_000,
+    "eval_every": 4_000,
+}
+"""One agent for sines, offsets and noise; experiments/one_agent_search.py found these settings."""
+
 _IN_MINUTES: dict[str, Any] = {
     "total_steps": 36_000,
     "hidden_size": 64,
@@ -99,5 +116,15 @@ PRESETS: dict[str, tuple[Grid, ...]] = {
     "rover": (_ROVER,),
     "pendulum": _PENDULUM,
     "paper": (_ROVER, *_PENDULUM),
+    "robust": (
+        Grid(
+            "pendulum",
+            (ROBUST_DISTURBANCE,),
+            (ROBUST_AGENT,),
+            (ROBUST_HISTORY_LENGTH,),
+            ROBUST_SETTINGS,
+        ),
+    ),
 }
-"""quick: minutes on two cores; rover: the paper's rover table; pendulum: its benchmark figures."""
+"""quick: minutes on two cores; rover: the paper's rover table; pendulum: its benchmark figures;
+paper: both; robust: one agent for sines, offsets and noise, which the paper leaves open."""

@@ -246,3 +246,15 @@ def test_a_log_becomes_an_exported_policy(tmp_path, capsys):
     player.reset()
     assert np.all(np.abs(player.step([-0.5, 0.0])) <= 1.0)
     assert len((EXPERIMENTS / "from_a_log.py").read_text().splitlines()) <= 60
+
+
+def test_one_agent_is_tested_under_every_condition(tmp_path, capsys):
+    one = load(EXPERIMENTS / "one_agent.py")
+    assert one.main(["--quick", "--agents", "lstm-td3-privileged", "--out", str(tmp_path)]) == 0
+    rows = pd.read_parquet(tmp_path / "one_agent.parquet")
+    assert set(rows["tested_on"]) == set(one.CONDITIONS)
+    noisy = rows[rows["tested_on"].isin(one.NOISY)]
+    # The filter's return is below the optimum, so a share of it is larger in size.
+    assert (noisy["of_the_filter"].abs() > noisy["normalised"].abs()).all()
+    assert rows["of_the_filter"].notna().sum() == len(noisy) == 2
+    assert "the worst structured condition" in capsys.readouterr().out
