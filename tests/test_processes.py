@@ -12,6 +12,7 @@ import jax
 import pytest
 
 from rtd3jax import sweep
+from rtd3jax.cli import sweep as command
 from rtd3jax.errors import UserError
 from rtd3jax.study import process_plan, processes, references
 from rtd3jax.study.crew import Crew, NoProcesses
@@ -21,6 +22,7 @@ from rtd3jax.study.plan import Grid, cell_jobs, label, make_cells
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.training.lanes import make_groups
 
+COMMAND = "rtd3jax.sweep"
 STEPS, SEEDS = 4_000, 3
 STUDY = [
     *("--env", "rover", "--disturbances", "ar1-slip", "--algorithms", "td3"),
@@ -221,7 +223,7 @@ def test_auto_chooses_processes_only_where_they_pay(monkeypatch):
         return process_plan.shares_of(asked, jobs, strategy, shell)
 
     assert chosen().cores == ((4,), (6,)) and chosen().lanes == 1
-    assert "2 processes, pinned" in str(chosen())
+    assert "2 processes, each pinned" in str(chosen())
     assert chosen(asked=1).processes == 1 and chosen(asked=2).processes == 2
     for other in (
         chosen(lanes_of(algorithms=("lstm-td3",), total_steps=5_000)),
@@ -249,6 +251,24 @@ def test_all_cores_are_divided(monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {1, 2, 3, 5, 8})
     shares = process_plan._divided(2)
     assert shares.cores == ((1, 2), (3, 5, 8)) and shares.lanes == 3
+
+
+def test_only_the_command_itself_counts_as_a_shells(monkeypatch):
+    """A script that calls it may have registered environments, which new processes lack."""
+    asked = []
+
+    def shares_of(processes, jobs, strategy, shell):
+        asked.append((processes, shell))
+        raise UserError("seen")
+
+    monkeypatch.setattr(command, "shares_of", shares_of)
+    monkeypatch.setattr(sys, "argv", ["sweep", *STUDY, "--out", "nowhere", "--dry-run"])
+    main = sys.modules["__main__"]
+    for spec in (None, type("Spec", (), {"name": "mine"}), type("Spec", (), {"name": COMMAND})):
+        monkeypatch.setattr(main, "__spec__", spec)
+        assert sweep.main() == 2
+    assert run("nowhere", "--dry-run") == 2
+    assert asked == [(None, False), (None, False), (None, True), (None, False)]
 
 
 class Member:

@@ -67,7 +67,13 @@ def _start(options: argparse.Namespace, arguments: Sequence[str] | None) -> int:
         relaunch("rtd3jax.sweep", arguments)
     if options.device:
         jax.config.update("jax_default_device", sweep_options.device(options.device))
-    return _run(options, shell=arguments is None)
+    return _run(options, shell=arguments is None and _is_command())
+
+
+def _is_command() -> bool:
+    """Whether Python runs ``rtd3jax.sweep`` itself, and not a script that calls `main`."""
+    spec = getattr(sys.modules["__main__"], "__spec__", None)
+    return spec is not None and spec.name == "rtd3jax.sweep"
 
 
 class _Terminated(KeyboardInterrupt):

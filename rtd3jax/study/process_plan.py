@@ -46,7 +46,7 @@ class Shares:
     def __str__(self) -> str:
         if self.processes == 1:
             return f"one process with a thread per core ({self.reason})"
-        pinned = ", pinned to its share of the cores" if self.cores[0] else ""
+        pinned = ", each pinned to its share of the cores" if self.cores[0] else ""
         return f"{self.processes} processes{pinned}"
 
 
