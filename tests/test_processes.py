@@ -19,6 +19,7 @@ from rtd3jax.study.crew import Crew, NoProcesses
 from rtd3jax.study.lock import is_held
 from rtd3jax.study.log import LOG, read_log
 from rtd3jax.study.plan import Grid, cell_jobs, label, make_cells
+from rtd3jax.study.report import data
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.training.lanes import make_groups
 
@@ -269,6 +270,17 @@ def test_only_the_command_itself_counts_as_a_shells(monkeypatch):
         assert sweep.main() == 2
     assert run("nowhere", "--dry-run") == 2
     assert asked == [(None, False), (None, False), (None, True), (None, False)]
+
+
+def test_rows_of_processes_that_write_at_the_same_time_are_of_one_session(tmp_path):
+    cell = lanes_of(1)[0].cell
+
+    def timing(*seconds):
+        rows = [{**cell.key, "seed": 0, "step": 10, "seconds": second} for second in seconds]
+        return data._timing(rows, type("Directory", (), {"path": tmp_path}))
+
+    assert timing(10.0, 10.003, 10.001, 20.0)["seconds"] == 20.0
+    assert timing(10.0, 10.003, 4.0, 20.0)["sessions"] == 2  # after a restart
 
 
 class Member:
