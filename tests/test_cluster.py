@@ -16,6 +16,7 @@ from rtd3jax.errors import UserError
 from rtd3jax.study import cluster, hosts
 from rtd3jax.study.execute import Work
 from rtd3jax.study.log import LOG
+from rtd3jax.study.log_reader import LogReader
 from rtd3jax.study.plan import Grid, cell_jobs, make_cells
 from rtd3jax.study.rundir import RunDirectory
 
@@ -244,7 +245,7 @@ def test_the_growing_log_is_read_once_and_by_whole_lines(tmp_path):
 
     path = directory.path / LOG
     path.write_text(line(0, 10))
-    log = cluster._Log(directory, logger)
+    log = LogReader(directory, logger)
     assert log.steps() == 10 and fed == []  # the trackers had it before
     with path.open("a") as file:
         file.write(line(0, 20) + line(1, 10) + line(1, 20)[:30])

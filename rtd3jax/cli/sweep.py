@@ -11,7 +11,7 @@ import functools
 import signal
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from rtd3jax.cli import sweep_options
 from rtd3jax.cli.common import exit_status
 from rtd3jax.errors import UserError
 from rtd3jax.study.cluster import train_on_cluster
+from rtd3jax.study.crew import NoProcesses
 from rtd3jax.study.execute import Work, train_here
 from rtd3jax.study.finish import finish
 from rtd3jax.study.hosts import own_shard, own_share, relaunch
@@ -28,6 +29,8 @@ from rtd3jax.study.lock import parse_shard, writer
 from rtd3jax.study.loggers import check_loggers, open_loggers
 from rtd3jax.study.memory_plan import lanes_at_once, usable_memory
 from rtd3jax.study.plan import make_cells, plan_text
+from rtd3jax.study.process_plan import Shares, shares_of
+from rtd3jax.study.processes import train_in_processes
 from rtd3jax.study.references import references_of
 from rtd3jax.study.rundir import RunDirectory, holds_study
 from rtd3jax.study.starts import add_starts, check_starts_stay
@@ -35,6 +38,9 @@ from rtd3jax.study.status import ledger
 from rtd3jax.system.imports import import_modules
 from rtd3jax.training.lanes import Job, workers
 from rtd3jax.training.run import check_strategy
+
+Trainer = Callable[..., None]
+"""`train_here`, or another function with the same arguments."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -61,7 +67,13 @@ def _start(options: argparse.Namespace, arguments: Sequence[str] | None) -> int:
         relaunch("rtd3jax.sweep", arguments)
     if options.device:
         jax.config.update("jax_default_device", sweep_options.device(options.device))
-    return _run(options)
+    return _run(options, shell=arguments is None and _is_command())
+
+
+def _is_command() -> bool:
+    """Whether Python runs ``rtd3jax.sweep`` itself, and not a script that calls `main`."""
+    spec = getattr(sys.modules["__main__"], "__spec__", None)
+    return spec is not None and spec.name == "rtd3jax.sweep"
 
 
 class _Terminated(KeyboardInterrupt):
@@ -79,7 +91,7 @@ def _on_termination(handler: Any) -> Any:
     return signal.signal(signal.SIGTERM, handler)
 
 
-def _run(options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace, shell: bool) -> int:
     if options.status:
         return _status(sweep_options.out(options))
     cells = make_cells(sweep_options.grids(options), sweep_options.overrides(options))
@@ -87,10 +99,13 @@ def _run(options: argparse.Namespace) -> int:
     episodes = sweep_options.count("final_episodes", options.final_episodes)
     strategy = check_strategy(options.strategy)
     check_loggers(options.log)
-    if sum(map(bool, (options.shard, options.distributed, options.cluster))) > 1:
+    processes = sweep_options.processes(options.processes)
+    divided = options.shard or options.distributed or options.cluster
+    several = processes is not None and processes > 1
+    if sum(map(bool, (options.shard, options.distributed, options.cluster, several))) > 1:
         raise UserError(
-            "--shard, --distributed and --cluster each divide the lanes among processes: "
-            "choose one of them"
+            "--processes, --shard, --distributed and --cluster each divide the lanes among "
+            "processes: choose one of them"
         )
     out = sweep_options.out(options)
     directory = RunDirectory(out, cells, seeds, episodes, prepare=False)
@@ -98,9 +113,13 @@ def _run(options: argparse.Namespace) -> int:
         check_starts_stay(cells, out)
     additions = "" if options.fresh else directory.plan()
     jobs = directory.jobs(strategy)
+    waiting = [job for job in jobs if options.fresh or not directory.lanes.is_done(*job.key)]
+    shares = shares_of(1 if divided else processes, waiting, strategy, shell)
     if options.dry_run:
         say = functools.partial(print, file=sys.stderr, flush=True)
         print(plan_text(directory.cells, directory.seeds, jobs, strategy, usable_memory(), say))
+        if not divided:
+            print(f"trained by {shares}")
         print(additions, end="\n" if additions else "")
         return 0
     if options.cluster:  # the nodes of the cluster need the memory, not this machine
@@ -123,10 +142,11 @@ def _run(options: argparse.Namespace) -> int:
         page=options.report,
         keep=options.keep_checkpoints,
     )
-    with writer(directory.path, shard):
+    with writer(directory.path, shard) as handles:
         if directory.refresh():  # another process has changed the study in the meantime
             jobs = directory.jobs(strategy)
-        return _train(directory, _share(jobs, shard, options), work, options)
+        jobs = _share(jobs, shard, options)
+        return _train(directory, jobs, work, options, _trainer(options, shares, handles))
 
 
 def _shard(options: argparse.Namespace) -> tuple[int, int] | None:
@@ -144,19 +164,41 @@ def _share(
     return jobs if shard is None else jobs[shard[0] - 1 :: shard[1]]
 
 
+def _trainer(options: argparse.Namespace, shares: Shares, handles: list[int]) -> Trainer:
+    """The function that trains the lanes: on a cluster, in several processes, or in this one."""
+    if options.cluster:
+        where = {"address": options.cluster, "imports": options.imports}
+        return functools.partial(train_on_cluster, **where)
+    if shares.processes == 1:
+        return train_here
+    where = {"shares": shares, "imports": options.imports, "handles": handles}
+    if sweep_options.processes(options.processes) is not None:
+        return functools.partial(train_in_processes, **where)
+
+    def train_anyway(*arguments: Any) -> None:
+        """Train in processes, which the user has not asked for, if the system lets them start."""
+        try:
+            train_in_processes(*arguments, **where)
+        except NoProcesses as error:
+            print(f"{error}: this process trains the lanes", file=sys.stderr)
+            train_here(*arguments)
+
+    return train_anyway
+
+
 def _train(
-    directory: RunDirectory, jobs: list[Job], work: Work, options: argparse.Namespace
+    directory: RunDirectory,
+    jobs: list[Job],
+    work: Work,
+    options: argparse.Namespace,
+    train: Trainer,
 ) -> int:
     references = references_of(directory.cells)
     complaints: list[str] = []
     interrupted = 0
     with open_loggers(options.log, directory) as logger:
         try:
-            if options.cluster:
-                where = options.cluster, options.imports
-                train_on_cluster(directory, jobs, work, complaints, references, logger, *where)
-            else:
-                train_here(directory, jobs, work, complaints, references, logger)
+            train(directory, jobs, work, complaints, references, logger)
         except KeyboardInterrupt as interrupt:
             interrupted = 143 if isinstance(interrupt, _Terminated) else 130
     finish(directory, references, page=options.report, interrupted=bool(interrupted))

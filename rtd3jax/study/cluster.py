@@ -28,9 +28,9 @@ from rtd3jax.study.derive import Reference
 from rtd3jax.study.execute import Work, train_here, waiting_jobs
 from rtd3jax.study.interim import InterimResults
 from rtd3jax.study.lane_files import cell_name
-from rtd3jax.study.log import LOG, lane_of, parse_log, steps_reached
+from rtd3jax.study.log_reader import LogReader
 from rtd3jax.study.loggers import Logger
-from rtd3jax.study.memory_plan import job_bytes, lanes_at_once, usable_memory
+from rtd3jax.study.memory_plan import WORKER_BYTES, job_bytes, lanes_at_once, usable_memory
 from rtd3jax.study.plan import Cell, label
 from rtd3jax.study.rundir import PACKAGES, RunDirectory
 from rtd3jax.system.imports import import_modules
@@ -42,8 +42,6 @@ TASKS = "cluster.jsonl"
 """File with a line per ended task: its cell, node and times, and the steps of its checkpoints."""
 _POLL_SECONDS = 0.1
 _KNOCK_SECONDS = 10.0
-_PROCESS_BYTES = 700 * 2**20
-"""Memory of a worker without lanes: Python, JAX and compiled programs."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,7 +103,7 @@ def train_on_cluster(
             arguments = (path, index, seeds, dataclasses.replace(work, quiet=True), need.cpus)
             pending[task.options(**options).remote(*arguments, list(imports))] = members
         interim = InterimResults(directory, references, page=work.page)
-        log = _Log(directory, logger)
+        log = LogReader(directory, logger)
         _watch(ray, directory, pending, complaints, interim, log, work.quiet)
 
 
@@ -161,7 +159,7 @@ def _need(members: Sequence[Job], work: Work, nodes: Sequence[dict]) -> Need:
     gpus = 1 if work.strategy == "vmap" else 0
     cpus = min(len(members), int(most["CPU"])) if work.strategy == "map" else 1
     # Under `map`, all lanes need memory for their states, and those that run for their work.
-    size = math.ceil(_PROCESS_BYTES + len(members) * state + max(cpus, 1) * working)
+    size = math.ceil(WORKER_BYTES + len(members) * state + max(cpus, 1) * working)
     need = Need(cpus, gpus, size)
     asked = {"CPU": max(need.cpus, 1), "GPU": need.gpus, "memory": need.memory}
     for name, amount in asked.items():
@@ -270,7 +268,7 @@ def _watch(
     pending: dict[Any, list[Job]],
     complaints: list[str],
     interim: InterimResults,
-    log: "_Log",
+    log: LogReader,
     quiet: bool,
 ) -> None:
     """Wait for the tasks; at Ctrl-C, tell them to write their checkpoints."""
@@ -320,36 +318,3 @@ def _outcome(ray: ModuleType, task: Any, directory: RunDirectory, jobs: Sequence
             if not directory.lanes.is_done(cell, seed):
                 directory.lanes.write_error(cell, seed, reason)
         return [f"{label(jobs[0])} failed: {reason}"]
-
-
-class _Log:
-    """Reads the log that the tasks write: the steps so far, and new rows for the trackers."""
-
-    def __init__(self, directory: RunDirectory, logger: Logger | None) -> None:
-        self._path = directory.path / LOG
-        self._cells = {tuple(cell.key.values()): cell for cell in directory.cells}
-        self._logger = logger
-        self._reached: dict[tuple[Any, ...], int] = {}
-        self._offset = 0
-        self._new_rows()  # the trackers have these rows already
-
-    def steps(self) -> int:
-        """The sum of all lanes' steps, each at its last evaluation."""
-        for row in self._new_rows():
-            if self._logger is not None:
-                self._logger.log(self._cells[lane_of(row)[:-1]], row["seed"], row)
-        return sum(self._reached.values())
-
-    def _new_rows(self) -> list[dict[str, Any]]:
-        """The new rows of the study's lanes: lines that were completed since the last call."""
-        if not self._path.exists():
-            return []
-        with self._path.open("rb") as file:
-            file.seek(self._offset)
-            text = file.read()
-        text = text[: text.rfind(b"\n") + 1]
-        self._offset += len(text)
-        rows = [row for row in parse_log(text.decode()) if lane_of(row)[:-1] in self._cells]
-        for lane, step in steps_reached(rows).items():
-            self._reached[lane] = max(step, self._reached.get(lane, 0))
-        return rows

@@ -1,7 +1,7 @@
 """Trains lanes of a run directory in this process."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -30,6 +30,8 @@ class Work:
         page: whether to write the page of the run.
         workers: maximum number of workers; all workers by default.
         keep: whether to keep the last checkpoint of a lane that has ended, for more steps later.
+        began: the value of `time.perf_counter` from which the log counts seconds, which is the same
+            clock in all processes of a machine; the start of the training by default.
     """
 
     strategy: str
@@ -39,6 +41,7 @@ class Work:
     page: bool = True
     workers: int | None = None
     keep: bool = False
+    began: float | None = None
 
 
 def train_here(
@@ -48,10 +51,12 @@ def train_here(
     complaints: list[str],
     references: Sequence[Reference] | None = None,
     logger: Logger | None = None,
+    watch: Callable[[Group], None] = lambda group: None,
 ) -> None:
     """Train the lanes that have not ended; add a line to ``complaints`` for each that fails.
 
-    With ``references``, tables and page are updated about once a minute.
+    With ``references``, tables and page are updated about once a minute. ``watch`` is called after
+    each chunk is recorded; if it raises KeyboardInterrupt, the lanes write their checkpoints.
     """
     waiting = waiting_jobs(directory, jobs)
     add_starts(directory, waiting, write=True)
@@ -63,12 +68,15 @@ def train_here(
     checkpoints = checkpoints_of(directory, work.interval)
     groups = make_groups(waiting, work.strategy, len(devices), work.at_once, checkpoints)
     interim = None if references is None else InterimResults(directory, references, page=work.page)
-    recorder = Recorder(directory, checkpoints, interim, logger, complaints, keep=work.keep)
+    recorder = Recorder(
+        directory, checkpoints, interim, logger, complaints, keep=work.keep, began=work.began
+    )
     with Progress(groups, label, enabled=not work.quiet) as bar:
 
         def on_chunk(group: Group) -> None:
             bar.update(group)
             recorder.update(group)
+            watch(group)
 
         advance_groups(groups, on_chunk, checkpoints, devices)
 

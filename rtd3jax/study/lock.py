@@ -24,22 +24,22 @@ def parse_shard(text: str) -> tuple[int, int]:
 
 
 @contextlib.contextmanager
-def writer(directory: Path, shard: tuple[int, int] | None) -> Iterator[None]:
-    """Hold the lock of the directory, or of one of its shards.
+def writer(directory: Path, shard: tuple[int, int] | None) -> Iterator[list[int]]:
+    """Hold the lock of the directory, or of one of its shards; yield the handles of its files.
+
+    On POSIX, a process that inherits the handles holds the lock too, until it ends.
 
     Raises:
         UserError: when another process holds the same lock.
     """
     with contextlib.ExitStack() as stack:
         whole = "another process is writing to it"
-        if shard is None:
-            _hold(stack, directory, directory / ".lock", False, whole)
-        else:
-            _hold(stack, directory, directory / ".lock", True, whole)
+        handles = [_hold(stack, directory, directory / ".lock", shard is not None, whole)]
+        if shard is not None:
             name = f".lock-{shard[0]}-of-{shard[1]}"
             taken = f"another process is writing shard {shard[0]}/{shard[1]} of it"
-            _hold(stack, directory, directory / name, False, taken)
-        yield
+            handles.append(_hold(stack, directory, directory / name, False, taken))
+        yield handles
 
 
 @contextlib.contextmanager
@@ -72,19 +72,20 @@ def is_held(directory: Path) -> bool:
 
 def _hold(
     stack: contextlib.ExitStack, directory: Path, path: Path, shared: bool, reason: str
-) -> None:
+) -> int:
     handle = _open(directory, path)
     stack.callback(os.close, handle)
     for patience in (0.1, 0.2, None):  # --status holds a lock for a moment to test it
         try:
             lock(handle, shared=shared)
-            return
+            break
         except BlockingIOError as error:
             if patience is None:
                 raise UserError(
                     f"--out {directory}: {reason}; wait for it, or use --shard i/n"
                 ) from error
             time.sleep(patience)
+    return handle
 
 
 def _open(directory: Path, path: Path) -> int:

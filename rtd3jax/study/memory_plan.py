@@ -28,6 +28,9 @@ _HEADROOM = 0.8
 PROCESS_BYTES = 1_150 * 2**20
 """Bytes of a process without lanes: Python, JAX, compiled programs, tables and figures."""
 
+WORKER_BYTES = 700 * 2**20
+"""Bytes of a process that only trains, without lanes: Python, JAX and compiled programs."""
+
 
 def state_bytes(job: Job) -> int:
     """Exact bytes of a lane's state: parameters, optimisers, replay, carries, environment."""
@@ -98,6 +101,18 @@ def lanes_at_once(jobs: Sequence[Job], strategy: str, workers: int, memory: int)
             "batch_size or history_length"
         )
     return max(1, fit)
+
+
+def processes_bytes(jobs: Sequence[Job], processes: int, lanes: int) -> int:
+    """Bytes of a study whose lanes are trained by processes besides the one that plans.
+
+    Args:
+        jobs: the lanes of the study.
+        processes: number of processes that train.
+        lanes: number of lanes that each of them trains at a time.
+    """
+    state, work = (max(sizes) for sizes in zip(*job_bytes(jobs).values(), strict=True))
+    return PROCESS_BYTES + processes * (WORKER_BYTES + lanes * (state + work))
 
 
 def usable_memory() -> int:

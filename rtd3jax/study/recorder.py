@@ -29,11 +29,13 @@ class Recorder:
         complaints: list[str],
         *,
         keep: bool = False,
+        began: float | None = None,
     ):
         """Create the recorder.
 
         Without ``interim``, another process updates the tables and the page. With ``keep``, the
-        last checkpoint of a lane is kept when the lane ends.
+        last checkpoint of a lane is kept when the lane ends. ``began`` is the value of
+        `time.perf_counter` from which the log counts seconds; now by default.
         """
         self._directory = directory
         self._checkpoints = checkpoints
@@ -41,7 +43,7 @@ class Recorder:
         self._logger = logger
         self._logged: dict[int, int] = {}
         self._there = repair_log(directory.path / LOG)
-        self._began = time.perf_counter()
+        self._began = time.perf_counter() if began is None else began
         self._complaints = complaints
         self._keep_checkpoints = keep
 

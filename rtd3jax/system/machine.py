@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 _CGROUP = Path("/sys/fs/cgroup")
@@ -52,25 +53,48 @@ def _physical_on_windows() -> int:
         return 8 * 2**30  # unknown: a usual size is assumed
 
 
+def core_quota() -> float | None:
+    """Cores whose time the containers of this process allow it; None without such a limit.
+
+    A process may run on every core of `cores`, but is stopped when it has used this time.
+    """
+    found = []
+    for group, unified in _own_cgroups("cpu"):
+        if unified:
+            with contextlib.suppress(OSError, ValueError):  # "max" has no number
+                quota, period = map(int, (group / "cpu.max").read_text(encoding="utf-8").split())
+                found.append(quota / period)
+        else:
+            numbers = (_number(group / f"cpu.cfs_{name}_us") for name in ("quota", "period"))
+            found += [q / p for q, p in zip(*numbers, strict=False) if q > 0]  # -1: no limit
+    return min(found, default=None)
+
+
 def _cgroup_limits() -> list[int]:
     """Limits of containers and batch systems: of this cgroup (v1 or v2) and all its parents."""
     found = []
+    for group, unified in _own_cgroups("memory"):
+        found += _number(group / ("memory.max" if unified else "memory.limit_in_bytes"))
+    return found
+
+
+def _own_cgroups(controller: str) -> Iterator[tuple[Path, bool]]:
+    """Directories of this process's cgroups and their parents, each with whether it is of v2."""
     with contextlib.suppress(OSError, ValueError):
         for line in _OWN_CGROUPS.read_text(encoding="utf-8").splitlines():
             _, controllers, path = line.split(":", 2)
             if controllers == "":
-                root, name = _CGROUP, "memory.max"
-            elif "memory" in controllers.split(","):
-                root, name = _CGROUP / "memory", "memory.limit_in_bytes"
+                root = _CGROUP
+            elif controller in controllers.split(","):
+                root = _CGROUP / controller
             else:
                 continue
             group = root / path.strip("/")
             # In a container, the path may be the host's, which is not visible; the root is.
             for directory in (group, *group.parents):
-                found += _number(directory / name)
+                yield directory, root == _CGROUP
                 if directory == root:
                     break
-    return found
 
 
 def _number(file: Path) -> list[int]:

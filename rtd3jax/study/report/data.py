@@ -246,6 +246,10 @@ def _ledger(directory: RunDirectory, notes: list[str]) -> list[dict[str, Any]]:
         return []
 
 
+_SWAPPED = 0.1
+"""Seconds by which rows of processes that write at the same time may be out of order."""
+
+
 def _timing(rows: list[dict[str, Any]], directory: RunDirectory) -> dict[str, Any] | None:
     """Times from the log; the clock starts at zero in each session.
 
@@ -261,7 +265,8 @@ def _timing(rows: list[dict[str, Any]], directory: RunDirectory) -> dict[str, An
     ]
     if shards:
         return {"steps": steps, "shards": len(shards)}
-    ends = [a for a, b in zip(stamps, [*stamps[1:], -1.0], strict=True) if a is not None and b < a]
+    following = [*stamps[1:], -1.0]
+    ends = [a for a, b in zip(stamps, following, strict=True) if a is not None and b < a - _SWAPPED]
     seconds = sum(ends)
     return {
         "steps": steps,
