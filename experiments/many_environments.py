@@ -4,11 +4,12 @@ Usage: python experiments/many_environments.py [--quick] [--seeds N] [--out DIR]
 
 The agent is `lstm-td3-1ha1hc` under AR(1) slip with the settings of the preset `rover`. There are
 five paired seeds, each tested in 1,000 episodes. Both variants are trained alternately, seed by
-seed, so other work on the machine affects both. The script writes many_environments.md, .parquet
-and .json.
+seed, and their time is that of the processor, so other work on the machine affects both alike. The
+script writes many_environments.md, .parquet and .json; existing rows are kept.
 """
 
 import argparse
+import itertools
 import pathlib
 import sys
 import time
@@ -31,15 +32,15 @@ def trained(count: int, seed: int, episodes: int, tiny: dict[str, object]) -> di
     env = rtd.make("rover", DISTURBANCE)
     fields = {**ROVER_SETTINGS, "total_steps": ROVER_STEPS, **tiny, "environments": count}
     config = rtd.Config(AGENT, ROVER_HISTORY_LENGTH, **fields)
-    began = time.perf_counter()
+    began = time.process_time()
     run = rtd.train(env, config, [seed], progress=False)
-    seconds = time.perf_counter() - began
+    seconds = time.process_time() - began
     returns = rtd.evaluate(run.policy(seed), env, episodes, seed=seed)
     return {
         "environments": count,
         "seed": seed,
         "mean": float(np.mean(returns)),
-        "seconds": seconds,
+        "cpu_seconds": seconds,
         "updates": config.updates,
     }
 
@@ -58,29 +59,33 @@ def main(arguments: list[str] | None = None) -> int:
     else:  # compile both programs before the measurements
         for count in COUNTS:
             trained(count, 99, 1, {"total_steps": 2_000})
-    rows = []
-    for seed in range(options.seeds):
-        for count in COUNTS:
-            rows.append(trained(count, seed, episodes, tiny))
-            print(rows[-1], flush=True)
+    path = options.out / "many_environments.parquet"
+    rows = pd.read_parquet(path).to_dict("records") if path.exists() else []
+    for seed, count in itertools.product(range(options.seeds), COUNTS):
+        if any((row["seed"], row["environments"]) == (seed, count) for row in rows):
+            continue
+        rows.append(trained(count, seed, episodes, tiny))
+        print(rows[-1], flush=True)
+        options.out.mkdir(parents=True, exist_ok=True)
+        pd.DataFrame(rows).to_parquet(path, index=False)
     table = pd.DataFrame(rows)
     one, many = (table[table["environments"] == count] for count in COUNTS)
     differences = many["mean"].to_numpy() - one["mean"].to_numpy()
     mean, low, high = interval(differences)
-    share = many["seconds"].mean() / one["seconds"].mean()
+    share = many["cpu_seconds"].mean() / one["cpu_seconds"].mean()
     body = [
         [
             str(count),
             f"{own['mean'].mean():.3f} ± {own['mean'].std():.3f}",
-            f"{own['seconds'].mean():.1f}",
+            f"{own['cpu_seconds'].mean():.1f}",
             f"{own['updates'].iloc[0]:,}",
         ]
         for count, own in table.groupby("environments")
     ]
-    text = markdown_table(["environments", "return", "seconds a lane", "updates"], body)
+    text = markdown_table(["environments", "return", "CPU seconds a lane", "updates"], body)
     text += (
         f"\n\nDifference of pairs {mean:+.3f} [{low:+.3f}, {high:+.3f}] (95%); "
-        f"{share:.2f} of the time.\n"
+        f"{share:.2f} of the processor's time.\n"
     )
     steps = tiny.get("total_steps", ROVER_STEPS)
     write_results(

@@ -34,9 +34,12 @@ def test_killed_sweeps_resume_to_the_same_bits(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "searched", ["rover", "pendulum", pytest.param("one_agent", marks=pytest.mark.slow)]
+    "searched",
+    ["rover", "pendulum", "gymnasium", pytest.param("one_agent", marks=pytest.mark.slow)],
 )
 def test_the_search_runs_and_keeps_its_rows(searched, tmp_path, monkeypatch):
+    if searched == "gymnasium":
+        pytest.importorskip("mujoco")
     search = load(EXPERIMENTS / f"{searched}_search.py")
     monkeypatch.setattr(search, "scale", lambda name: (-1200.0, -136.0), raising=False)
     monkeypatch.setattr(search, "CHANGES", ({"gamma": 0.5},))

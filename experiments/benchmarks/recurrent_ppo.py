@@ -1,0 +1,91 @@
+"""Trains sb3-contrib's RecurrentPPO on InvertedPendulum-v5 with hidden velocities.
+
+Usage: python -m experiments.benchmarks.recurrent_ppo [--quick] [--out FILE]
+
+`MlpLstmPolicy` with the package's defaults, as its documentation uses it: 30,000 steps, three
+seeds, the final deterministic policy tested on 100 episodes, as
+experiments/gymnasium_simulators.py tests the agents of this package. sb3-contrib is not a
+dependency; it needs an environment of its own: `pip install sb3-contrib 'gymnasium[mujoco]'`. The
+script writes experiments/results/benchmarks/recurrent_ppo.csv: a row per seed. A seed that has a
+row is not trained again.
+"""
+
+import argparse
+import importlib.metadata
+import pathlib
+import sys
+import time
+
+import gymnasium
+import numpy as np
+import pandas as pd
+import torch
+from sb3_contrib import RecurrentPPO
+
+RESULTS = pathlib.Path(__file__).parents[1] / "results" / "benchmarks"
+SEEDS, STEPS, EPISODES, KEEP = 3, 30_000, 100, (0, 1)
+
+
+def make() -> gymnasium.Env:
+    """The simulator, of which only position and angle are observed."""
+    env = gymnasium.make("InvertedPendulum-v5")
+    seen = env.observation_space
+    hidden = gymnasium.spaces.Box(seen.low[list(KEEP)], seen.high[list(KEEP)], dtype=seen.dtype)
+    return gymnasium.wrappers.TransformObservation(env, lambda full: full[list(KEEP)], hidden)
+
+
+def tested(model: RecurrentPPO, episodes: int, seed: int) -> np.ndarray:
+    """The returns of the deterministic policy, float64 [episodes]."""
+    env = make()
+    returns = np.zeros(episodes)
+    for episode in range(episodes):
+        observation, _ = env.reset(seed=1_000_000 * (seed + 1) + episode)
+        states, start, done = None, True, False
+        while not done:
+            action, states = model.predict(
+                observation, states, episode_start=np.array([start]), deterministic=True
+            )
+            observation, reward, terminated, truncated, _ = env.step(action)
+            returns[episode] += float(reward)
+            start, done = False, terminated or truncated
+    return returns
+
+
+def trained(seed: int, steps: int, episodes: int) -> dict[str, object]:
+    """Train and test one seed."""
+    began = time.process_time()
+    model = RecurrentPPO("MlpLstmPolicy", make(), seed=seed, device="cpu")
+    model.learn(steps)
+    seconds = time.process_time() - began
+    return {
+        "seed": seed,
+        "steps": model.num_timesteps,
+        "mean": float(np.mean(tested(model, episodes, seed))),
+        "cpu_seconds": round(seconds, 1),
+        "sb3_contrib": importlib.metadata.version("sb3-contrib"),
+        "gymnasium": gymnasium.__version__,
+    }
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
+    parser.add_argument("--out", type=pathlib.Path, default=RESULTS / "recurrent_ppo.csv")
+    options = parser.parse_args(arguments)
+    seeds, steps, episodes = (1, 128, 2) if options.quick else (SEEDS, STEPS, EPISODES)
+    torch.set_num_threads(1)
+    rows = pd.read_csv(options.out).to_dict("records") if options.out.exists() else []
+    for seed in range(seeds):
+        if any(row["seed"] == seed for row in rows):
+            continue
+        rows.append(trained(seed, steps, episodes))
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        pd.DataFrame(rows).to_csv(options.out, index=False)
+        print(rows[-1], flush=True)
+    means = pd.DataFrame(rows)["mean"]
+    print(f"{means.mean():.1f} ± {means.std():.1f}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
