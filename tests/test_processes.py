@@ -123,6 +123,7 @@ def test_a_killed_process_is_replaced_and_every_file_is_the_same(
 
 
 @needs_two_cores
+@pytest.mark.slow
 def test_after_sigterm_the_rest_is_the_same(whole, tmp_path, at_a_lanes_first_steps, capsys):
     out = tmp_path / "run"
     pids = []

@@ -16,6 +16,7 @@ from rtd3jax.agents.learners.base import Networks
 from rtd3jax.agents.networks import carry_before, segment_carries
 from rtd3jax.agents.replay import (
     Transition,
+    Truth,
     empty_replay,
     gather,
     gather_segments,
@@ -40,7 +41,8 @@ def _ring(agent, memory="lstm"):
     """A ring that has wrapped, of random rows and carries; and the number of rows written."""
     actor = make_part(AGENTS[agent], "actor", memory, OBSERVATION, ACTION, WIDTH)
     carry = actor.zero_carry(1) if AGENTS[agent].stores_carry else None
-    replay, number = empty_replay(CAPACITY, OBSERVATION, ACTION, carry), 0
+    size = OBSERVATION if AGENTS[agent].reads_truth else 0
+    replay, number = empty_replay(CAPACITY, OBSERVATION, ACTION, carry, 1, size), 0
     random = np.random.default_rng(0)
 
     def draw(*shape):
@@ -58,6 +60,7 @@ def _ring(agent, memory="lstm"):
                 next_observation=after,
                 terminated=jnp.asarray(last and episode % 2 == 0),
                 episode_step=jnp.int32(episode_step),
+                truth=Truth(draw(OBSERVATION), draw(OBSERVATION)) if size else None,
             )
             one = jax.tree.map(lambda leaf: leaf[None], row)
             replay = put(replay, jnp.int32(number), one)
