@@ -60,7 +60,7 @@ class Agent:
         config: the configuration.
         observation_size: O.
         action_size: A.
-        true_observation_size: S; 0 if the environment does not tell the undisturbed observation.
+        true_observation_size: S, if the critics read the undisturbed observation, else 0.
     """
 
     variant: Variant
@@ -100,7 +100,7 @@ class Agent:
     @property
     def reads_truth(self) -> bool:
         """Whether the critics read the undisturbed observation, which the replay then stores."""
-        return self.variant.reads_truth
+        return self.true_observation_size > 0
 
     def empty_replay(self) -> Replay:
         """An empty ring buffer for the agent's transitions."""
@@ -111,7 +111,7 @@ class Agent:
             self.action_size,
             carry,
             self.config.environments,
-            self.true_observation_size if self.reads_truth else 0,
+            self.true_observation_size,
         )
 
     def zero_carry(self) -> Carry | None:
@@ -222,7 +222,7 @@ def make_agent(config: Config, interface: Sizes) -> Agent:
     """
     variant: Variant = AGENTS[config.algorithm]
     sizes = interface.observation_size, interface.action_size, config.hidden_size
-    truth = interface.true_observation_size
+    truth = interface.true_observation_size if variant.reads_truth else 0
     if variant.reads_truth and not truth:
         raise UserError(
             f"agent {config.algorithm!r}: its critics read the undisturbed observation, which the "
@@ -254,7 +254,7 @@ def make_part(
     action_size: int,
     width: int,
     precision: str = "float32",
-    true_observation_size: int | None = None,
+    true_observation_size: int = 0,
 ) -> Network:
     """An agent's ``actor`` or ``critic``.
 
@@ -266,7 +266,7 @@ def make_part(
         action_size: A.
         width: width H of every layer.
         precision: precision of the factors of large products.
-        true_observation_size: S; O by default.
+        true_observation_size: S; 0 for S = O.
     """
     # The class is part of the key, so that a memory that replaced another takes effect.
     sizes = observation_size, action_size, width
@@ -304,7 +304,7 @@ def _part(
     action_size: int,
     width: int,
     precision: str,
-    true_observation_size: int | None,
+    true_observation_size: int,
 ) -> Network:
     return make_network(
         getattr(variant, role),

@@ -13,7 +13,6 @@ Shapes: ``C`` capacity of the ring, ``L`` past tokens, ``B`` batch, ``M`` segmen
 ``O`` and ``A`` sizes of an observation and an action.
 """
 
-import dataclasses
 from typing import Any
 
 import jax
@@ -106,8 +105,7 @@ class Segment:
     @property
     def present(self) -> Window:
         """The current step only: a window without past tokens."""
-        window = present(self.observation, self.previous_action)
-        return dataclasses.replace(window, true_observation=self.true_observation)
+        return present(self.observation, self.previous_action, self.true_observation)
 
 
 History = Window | Segment
@@ -119,7 +117,11 @@ def flat(rows: jax.Array) -> jax.Array:
     return rows.reshape(-1, *rows.shape[2:])
 
 
-def present(observation: jax.Array, previous_action: jax.Array) -> Window:
+def present(
+    observation: jax.Array,
+    previous_action: jax.Array,
+    true_observation: jax.Array | None = None,
+) -> Window:
     """The window without past tokens: ``observation`` [B, O] after ``previous_action`` [B, A]."""
     batch = observation.shape[0]
     past = Steps(
@@ -127,7 +129,8 @@ def present(observation: jax.Array, previous_action: jax.Array) -> Window:
         previous_action=jnp.zeros((0, *previous_action.shape), jnp.float32),
         action=jnp.zeros((0, *previous_action.shape), jnp.float32),
     )
-    return Window(past, jnp.zeros((batch,), jnp.int32), observation, previous_action)
+    length = jnp.zeros((batch,), jnp.int32)
+    return Window(past, length, observation, previous_action, true_observation)
 
 
 def empty_steps(capacity: int, observation_size: int, action_size: int) -> Steps:

@@ -348,9 +348,9 @@ def _output(network: Network, params: Params, *inputs: Any, method: str | None =
 
 
 def part_sizes(
-    observation_size: int, action_size: int, true_observation_size: int | None = None
+    observation_size: int, action_size: int, true_observation_size: int = 0
 ) -> dict[str, int]:
-    """Number of elements of each part of a token; without ``true_observation_size``, S = O."""
+    """Number of elements of each part of a token; ``true_observation_size`` 0 is for S = O."""
     return {
         "observation": observation_size,
         "action": action_size,

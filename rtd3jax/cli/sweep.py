@@ -146,7 +146,8 @@ def _run(options: argparse.Namespace, shell: bool) -> int:
         if directory.refresh():  # another process has changed the study in the meantime
             jobs = directory.jobs(strategy)
         jobs = _share(jobs, shard, options)
-        return _train(directory, jobs, work, options, _trainer(options, shares, handles))
+        trainer = _trainer(options, shares, handles, asked=processes is not None)
+        return _train(directory, jobs, work, options, trainer)
 
 
 def _shard(options: argparse.Namespace) -> tuple[int, int] | None:
@@ -164,15 +165,20 @@ def _share(
     return jobs if shard is None else jobs[shard[0] - 1 :: shard[1]]
 
 
-def _trainer(options: argparse.Namespace, shares: Shares, handles: list[int]) -> Trainer:
-    """The function that trains the lanes: on a cluster, in several processes, or in this one."""
+def _trainer(
+    options: argparse.Namespace, shares: Shares, handles: list[int], *, asked: bool
+) -> Trainer:
+    """The function that trains the lanes: on a cluster, in several processes, or in this one.
+
+    ``asked`` is whether the user has given the number of processes.
+    """
     if options.cluster:
         where = {"address": options.cluster, "imports": options.imports}
         return functools.partial(train_on_cluster, **where)
     if shares.processes == 1:
         return train_here
     where = {"shares": shares, "imports": options.imports, "handles": handles}
-    if sweep_options.processes(options.processes) is not None:
+    if asked:
         return functools.partial(train_in_processes, **where)
 
     def train_anyway(*arguments: Any) -> None:

@@ -1,5 +1,6 @@
 """Estimates the memory of lanes before allocation, and how many lanes fit together."""
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -64,17 +65,22 @@ def working_bytes(config: Config, observation_size: int, action_size: int) -> in
 def job_bytes(jobs: Sequence[Job]) -> dict[Any, tuple[int, int]]:
     """State bytes and temporary bytes of a lane, by program."""
     examples = {job.program: job for job in jobs}
-    return {
-        program: (
-            state_bytes(job),
-            working_bytes(
-                program.config,
-                program.observation_size,
-                job.program.bounds(job.lane).low.shape[0],
-            ),
-        )
-        for program, job in examples.items()
-    }
+    return {program: _lane_bytes(job) for program, job in examples.items()}
+
+
+# Several parts of a plan ask for the same lanes; each lane is traced for it.
+@functools.lru_cache(maxsize=512)
+def _lane_bytes(job: Job) -> tuple[int, int]:
+    """State bytes and temporary bytes of a lane."""
+    program = job.program
+    actions = program.bounds(job.lane).low.shape[0]
+    return state_bytes(job), working_bytes(program.config, program.observation_size, actions)
+
+
+def _largest(jobs: Sequence[Job]) -> tuple[int, int]:
+    """The largest state bytes, and the largest temporary bytes, of the lanes."""
+    states, works = zip(*job_bytes(jobs).values(), strict=True)
+    return max(states), max(works)
 
 
 def lanes_at_once(jobs: Sequence[Job], strategy: str, workers: int, memory: int) -> int:
@@ -86,7 +92,7 @@ def lanes_at_once(jobs: Sequence[Job], strategy: str, workers: int, memory: int)
     Raises:
         UserError: when not even one lane fits.
     """
-    state, work = (max(sizes) for sizes in zip(*job_bytes(jobs).values(), strict=True))
+    state, work = _largest(jobs)
     usable = int(_HEADROOM * memory)
     if strategy == "vmap":
         fit = usable // (state + work)
@@ -111,7 +117,7 @@ def processes_bytes(jobs: Sequence[Job], processes: int, lanes: int) -> int:
         processes: number of processes that train.
         lanes: number of lanes that each of them trains at a time.
     """
-    state, work = (max(sizes) for sizes in zip(*job_bytes(jobs).values(), strict=True))
+    state, work = _largest(jobs)
     return PROCESS_BYTES + processes * (WORKER_BYTES + lanes * (state + work))
 
 
