@@ -13,6 +13,7 @@ states the time of the matrix products of one step of `lstm-td3-1ha1hc` with a r
 import argparse
 import csv
 import importlib.util
+import itertools
 import os
 import pathlib
 import platform
@@ -66,18 +67,47 @@ def numpy_player(policy, directory):
     return module.Player().step
 
 
-def onnx_player(policy, directory):
+def onnx_session(policy, directory):
     path = directory / "policy.onnx"
     policy.export(path, format="onnx", overwrite=True)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
-    session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    return onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+
+
+def onnx_player(policy, directory):
+    session = onnx_session(policy, directory)
     state = {s.name: np.zeros((1, *s.shape[1:]), np.float32) for s in session.get_inputs()[1:]}
 
     def step(observation):
         action, *after = session.run(None, {"observation": observation[None], **state})
         state.update(zip(state, after, strict=True))
         return action[0]
+
+    return step
+
+
+def bound_onnx_player(policy, directory):
+    """As `onnx_player`, but with arrays that are bound once: docs/deploy_a_policy.md."""
+    session = onnx_session(policy, directory)
+    sources, results = session.get_inputs(), session.get_outputs()
+    seen, applied = (np.zeros((1, *own.shape[1:]), np.float32) for own in (sources[0], results[0]))
+    state = [[np.zeros((1, *part.shape[1:]), np.float32) for part in sources[1:]] for _ in range(2)]
+    bindings = []
+    for before, after in (state, state[::-1]):
+        binding = session.io_binding()
+        for source, array in zip(sources, (seen, *before), strict=True):
+            binding.bind_cpu_input(source.name, array)
+        for result, array in zip(results, (applied, *after), strict=True):
+            place = array.shape, array.ctypes.data
+            binding.bind_output(result.name, "cpu", 0, np.float32, *place)
+        bindings.append((binding, before, after))  # a binding does not keep its arrays alive
+    turns = itertools.cycle(bindings)
+
+    def step(observation):
+        seen[0] = observation
+        session.run_with_iobinding(next(turns)[0])
+        return applied[0]
 
     return step
 
@@ -111,6 +141,7 @@ def jax_player(policy, directory):
 FORMS = {
     "numpy": numpy_player,
     "onnx": onnx_player,
+    "onnx, bound": bound_onnx_player,
     "stablehlo": stablehlo_player,
     "jax (policy.step)": jax_player,
 }

@@ -20,7 +20,7 @@ def test_latency(tmp_path, monkeypatch):
     with (tmp_path / "latency.csv").open() as file:
         rows = list(csv.DictReader(file))
     # td3 has no window; lstm-td3 acts in both ways.
-    assert len(rows) == len({(r["agent"], r["acting"], r["form"]) for r in rows}) == 3 * 4
+    assert len(rows) == len({(r["agent"], r["acting"], r["form"]) for r in rows}) == 3 * 5
     assert all(float(row["us"]) > 0 for row in rows)
     text = (tmp_path / "latency.md").read_text()
     assert all(f"| `{agent}` |" in text for agent in ("td3", "lstm-td3"))
