@@ -19,7 +19,7 @@ import argparse
 import pathlib
 import sys
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -39,7 +39,7 @@ from rtd3jax.training.lanes import workers  # noqa: E402
 AGENT, WIDTH, EPISODES = "lstm-td3-1ha1hc", 64, 1_000
 PAPERS_BEST = 1.36
 """The divisor of the rover's returns: the paper's best agent has -1.36."""
-SEARCH_SEED, SEARCH_SEEDS, SEARCH_EPISODES = 100, 2, 400
+SEARCH_SEED, SEARCH_SEEDS, SEARCH_EPISODES = 100, 4, 400
 TASKS: dict[str, tuple[str, str, int]] = {
     "rover ar1-slip l=6": ("rover", "ar1-slip", 6),
     **{
@@ -59,22 +59,55 @@ CHOSEN: dict[tuple[str, int], dict[str, Any]] = {
     ),
 }
 """Of the candidates, by environment and history length."""
-CANDIDATES: dict[tuple[str, int], list[tuple[int, int, bool, str]]] = {
+
+
+class Candidate(NamedTuple):
+    """What a candidate for the segments changes in the settings with windows."""
+
+    batch_size: int
+    segment_length: int
+    burn_in_gradient: bool
+    acting: str
+    others: dict[str, Any] = {}
+    """Further fields of the configuration."""
+
+    def fields(self) -> dict[str, Any]:
+        """Fields of the configuration."""
+        own = self._asdict()
+        others = own.pop("others")
+        return {**SEGMENTS, **own, **others} if self.segment_length else {}
+
+    def key(self) -> dict[str, Any]:
+        """The columns of the table that name the candidate."""
+        others = " ".join(f"{name}={value}" for name, value in self.others.items())
+        return {**self._asdict(), "others": others or "-"}
+
+
+CANDIDATES: dict[tuple[str, int], list[Candidate]] = {
     ("pendulum", 6): [
-        (50, 5, True, "carry"),
-        (50, 5, True, "window"),
-        (80, 5, True, "window"),
-        (100, 10, True, "window"),
-        (100, 10, False, "carry"),
+        Candidate(50, 5, True, "carry"),
+        Candidate(50, 5, True, "window"),
+        Candidate(80, 5, True, "window"),
+        Candidate(100, 10, True, "window"),
+        Candidate(100, 10, False, "carry"),
+        Candidate(100, 5, False, "carry"),
+        Candidate(200, 10, False, "carry", {"update_every": 4}),
+        Candidate(100, 10, False, "carry", {"critic_learning_rate": 1e-3}),
+        Candidate(100, 10, False, "carry", {"actor_noise": 0.1}),
+        Candidate(100, 10, False, "carry", {"actor_learning_rate": 3e-4}),
+        Candidate(100, 10, False, "carry", {"tau": 0.005}),
     ],
     ("pendulum", 20): [
-        (100, 10, True, "carry"),
-        (100, 10, False, "carry"),
-        (200, 20, True, "carry"),
+        Candidate(100, 10, True, "carry"),
+        Candidate(100, 10, False, "carry"),
+        Candidate(200, 20, True, "carry"),
+        Candidate(200, 20, False, "carry", {"update_every": 4}),
+        Candidate(200, 10, False, "carry", {"update_every": 4}),
+        Candidate(100, 10, False, "carry", {"critic_learning_rate": 1e-3}),
+        Candidate(100, 10, False, "carry", {"actor_noise": 0.1}),
     ],
-    ("rover", 6): [(200, 10, False, "carry")],
+    ("rover", 6): [Candidate(200, 10, False, "carry")],
 }
-"""Batch size, segment length, whether the burn-in has gradients, and the way of acting."""
 SEARCHED = ("pendulum hidden l=6", "pendulum hidden l=20", "rover ar1-slip l=6")
 
 
@@ -148,21 +181,20 @@ def search(path: pathlib.Path, tasks: list[str], tiny: dict[str, Any]) -> None:
     for task in (name for name in SEARCHED if name in tasks):
         env, _, length = TASKS[task]
         base = settings(task)
-        windows = (base["batch_size"], 0, True, "window")
-        for way in (windows, *CANDIDATES[env, length]):
-            names = ("batch_size", "segment_length", "burn_in_gradient", "acting")
-            choice = dict(zip(names, way, strict=True))
-            if has(rows, task=task, **choice):
+        windows = Candidate(base["batch_size"], 0, True, "window")
+        for candidate in (windows, *CANDIDATES[env, length]):
+            if has(rows, task=task, **candidate.key()):
                 continue
-            fields = {**SEGMENTS, **choice} if choice["segment_length"] else {}
             seeds = range(SEARCH_SEED, SEARCH_SEED + (1 if tiny else SEARCH_SEEDS))
             began = time.process_time()
+            fields = candidate.fields()
             found = returns(task, fields, seeds, 10 if tiny else SEARCH_EPISODES, tiny)
-            own = found.pop(way[-1])
+            own = found.pop(candidate.acting)
             (other,) = found.values()
             row = {
                 "task": task,
-                **choice,
+                **candidate.key(),
+                "seeds": len(seeds),
                 "mean": round(float(np.mean(own)), 3),
                 "worst_seed": round(min(own), 3),
                 "acting_otherwise": round(float(np.mean(other)), 3),
