@@ -1,14 +1,15 @@
 """From invented slip to soil: the rover's agents on the rover on soil, without further training.
 
-Usage: python experiments/rover_soil.py [--quick] [--slip-run DIR] [--run DIR] [--out DIR]
-                                        [--steps N] [--report]
+Usage: python experiments/rover_soil.py [--quick] [--run DIR] [--out DIR] [--steps N]
+                                        [--sources S ...] [--report]
 
-Six agents, five seeds, trained on the rover's AR(1) and sine slip: those of experiments/rover.py,
-in its run directory, where what is missing is trained. Beside them the same six, trained with the
-same setting on each ground, in a run directory of their own; and controllers that need no training.
-All are tested on every ground in 1,000 episodes, and the agents of the grounds on the two slips.
-Writes rover_soil.md, rover_soil.parquet (a row per policy and world) and rover_soil.json.
-`--report` only evaluates what there is.
+Six agents, five seeds, are trained under the rover's sine and AR(1) slip, and with the same setting
+on each ground. Beside them stand controllers that need no training. Every policy is tested in 1,000
+episodes: those of the slips on each ground, and those of a ground there and under both slips. The
+script writes rover_soil.md, rover_soil.parquet (a row per policy and world) and rover_soil.json. It
+trains the cells that the table does not have yet, as a study in DIR, in the order of `SOURCES`; if
+you repeat the command, also on another machine, it only trains what is missing. `--report` does not
+train: it tests what DIR has so far, also of a study that has not ended.
 
 Intervals are 95% bootstrap intervals over seeds (10,000 resamples, fixed random numbers).
 """
@@ -23,7 +24,7 @@ import pandas as pd
 
 import rtd3jax as rtd
 from rtd3jax.envs.rover_soil.controllers import adaptive_slip, feedforward_pi
-from rtd3jax.study.plan import Cell, Grid, make_cells
+from rtd3jax.study.plan import Grid, make_cells
 from rtd3jax.study.presets import ROVER_HISTORY_LENGTH as HISTORY_LENGTH
 from rtd3jax.study.presets import ROVER_SETTINGS as SETTINGS
 from rtd3jax.study.presets import ROVER_STEPS as STEPS
@@ -31,65 +32,98 @@ from rtd3jax.study.presets import ROVER_STEPS as STEPS
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from claims import RESAMPLES, ROVER_MARGIN, Effect  # noqa: E402
 from rover import EPISODES, PAPER_EPISODES, SEEDS  # noqa: E402
-from rover import train as train_on_slip  # noqa: E402
 from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
 
 SLIPS = ("ar1-slip", "sine-slip")
 GROUNDS = ("dry-sand", "mixed", "mixed-slope")
+SOURCES = ("sine-slip", "ar1-slip", "mixed", "dry-sand", "mixed-slope")
+"""What agents are trained on, in an order that soon gives a useful table."""
 TINY = {"hidden_size": 4, "batch_size": 4, "learning_starts": 10}
 TINY |= {"eval_every": 60, "eval_episodes": 1}
 QUICK_STEPS, QUICK_EPISODES = 60, 20
-COLUMNS = ["algorithm", "trained_on", "tested_on", "seed", "episodes", "mean", "standard_error"]
+KEY = ["algorithm", "trained_on", "tested_on", "seed"]
+COLUMNS = [*KEY, "steps", "episodes", "mean", "standard_error"]
+UNTRAINED = "no training"
 
 
-def cells_on_soil(steps: int, tiny: dict[str, object]) -> list[Cell]:
-    """Every agent on every ground; one of them where it is ``tiny``."""
+def world(name: str) -> tuple[str, str]:
+    """The environment and the disturbance of a slip or a ground."""
+    return ("rover-soil" if name in GROUNDS else "rover", name)
+
+
+def tests_of(source: str) -> tuple[str, ...]:
+    """What policies trained on ``source`` are tested on."""
+    return (source, *SLIPS) if source in GROUNDS else GROUNDS
+
+
+def wanted(sources: list[str], steps: int, tiny: dict[str, object]) -> list[rtd.Cell]:
+    """A cell for each source and agent; of two agents where they are ``tiny``."""
+    agents = rtd.ALGORITHMS[:2] if tiny else rtd.ALGORITHMS
     settings = {**SETTINGS, "total_steps": steps, **tiny}
-    grid = Grid("rover-soil", GROUNDS, rtd.ALGORITHMS, (HISTORY_LENGTH,), settings)
-    cells = make_cells((grid,), {})
-    return cells[:1] if tiny else cells
+    grids = [
+        Grid(world(source)[0], (source,), agents, (HISTORY_LENGTH,), settings) for source in sources
+    ]
+    return make_cells(tuple(grids), {})
 
 
-def train_on_soil(run: pathlib.Path, steps: int, tiny: dict[str, object]) -> list[str]:
-    """Train what is missing; a line for each lane that was lost."""
-    seeds, episodes = range(1 if tiny else SEEDS), 1 if tiny else PAPER_EPISODES
-    study = rtd.Study(cells_on_soil(steps, tiny), seeds=seeds, out=run, final_episodes=episodes)
-    return study.run(quiet=bool(tiny), page=not tiny)
+def has(rows: pd.DataFrame, cell: rtd.Cell, seed: int) -> bool:
+    """Whether ``rows`` has all tests of a lane."""
+    own = rows[
+        (rows["algorithm"] == cell.config.algorithm)
+        & (rows["trained_on"] == cell.disturbance)
+        & (rows["seed"] == seed)
+        & (rows["steps"] == cell.config.total_steps)
+    ]
+    return set(tests_of(cell.disturbance)) <= set(own["tested_on"])
 
 
-def row_of(policy: object, world: tuple[str, str], who: tuple, episodes: int) -> dict[str, object]:
-    """Evaluate ``policy``, which is (algorithm, trained on, seed), in ``world``."""
-    returns = np.asarray(rtd.evaluate(policy, rtd.make(*world), episodes, seed=who[2]), np.float64)
+def train(
+    run: pathlib.Path, cells: list[rtd.Cell], rows: pd.DataFrame, seeds: int, quiet: bool
+) -> list[str]:
+    """Train the cells that ``rows`` does not have; return a line for each lane that was lost."""
+    todo = [cell for cell in cells if not all(has(rows, cell, seed) for seed in range(seeds))]
+    print(f"the table has {len(cells) - len(todo)} of {len(cells)} cells", flush=True)
+    if not todo:
+        return []
+    episodes = 1 if quiet else PAPER_EPISODES
+    study = rtd.Study(todo, seeds=range(seeds), out=run, final_episodes=episodes)
+    return study.run(quiet=quiet, page=not quiet)
+
+
+def row_of(policy: object, tested_on: str, who: tuple, episodes: int) -> dict[str, object]:
+    """Test ``policy``, which is (algorithm, trained on, seed, steps); the values of a row."""
+    algorithm, trained_on, seed, steps = who
+    env = rtd.make(*world(tested_on))
+    returns = np.asarray(rtd.evaluate(policy, env, episodes, seed=seed), np.float64)
     error = float(returns.std(ddof=1) / np.sqrt(episodes))
-    values = (who[0], who[1], world[1], who[2], episodes, float(returns.mean()), error)
+    values = (algorithm, trained_on, tested_on, seed, steps, episodes, float(returns.mean()), error)
     return dict(zip(COLUMNS, values, strict=True))
 
 
 def agents(
-    runs: dict[str, pathlib.Path], grounds: tuple[str, ...], seeds: int, episodes: int
+    run: pathlib.Path, cells: list[rtd.Cell], rows: pd.DataFrame, seeds: int, episodes: int
 ) -> tuple[list[dict], list[str]]:
-    """A row per trained policy and world, and what is missing."""
-    plan = [("rover", slip, ground) for ground in grounds for slip in SLIPS]
-    plan += [("rover-soil", ground, world) for ground in grounds for world in (ground, *SLIPS)]
-    rows, missing = [], []
-    for trained_in, trained_on, tested_on in plan:
-        world = ("rover-soil" if tested_on in GROUNDS else "rover", tested_on)
-        for algorithm in rtd.ALGORITHMS:
-            for seed in range(seeds):
-                try:
-                    policy = rtd.load_policy(
-                        runs[trained_in], algorithm=algorithm, disturbance=trained_on, seed=seed
-                    )
-                except rtd.UserError as error:
-                    missing.append(str(error))
-                    continue
-                rows.append(row_of(policy, world, (algorithm, trained_on, seed), episodes))
-    return rows, sorted(set(missing))
+    """A row for each test of a trained policy that ``rows`` does not have, and what is missing."""
+    found, missing = [], []
+    for cell in cells:
+        for seed in (seed for seed in range(seeds) if not has(rows, cell, seed)):
+            who = (cell.config.algorithm, cell.disturbance, seed)
+            try:
+                policy = rtd.load_policy(run, algorithm=who[0], disturbance=who[1], seed=seed)
+            except rtd.UserError as error:
+                missing.append(str(error))
+                continue
+            who = (*who, cell.config.total_steps)
+            found += [row_of(policy, name, who, episodes) for name in tests_of(cell.disturbance)]
+    return found, sorted(set(missing))
 
 
-def controllers(grounds: tuple[str, ...], seeds: int, episodes: int) -> list[dict]:
-    """A row per controller, ground and seed."""
-    rows = []
+def controllers(
+    grounds: tuple[str, ...], rows: pd.DataFrame, seeds: int, episodes: int
+) -> list[dict]:
+    """A row for each controller, ground and seed that ``rows`` does not have."""
+    there = set(rows[rows["trained_on"] == UNTRAINED][KEY].itertuples(index=False, name=None))
+    found = []
     for ground in grounds:
         env = rtd.make("rover-soil", ground)
         policies = {
@@ -100,9 +134,22 @@ def controllers(grounds: tuple[str, ...], seeds: int, episodes: int) -> list[dic
         }
         for name, policy in policies.items():
             for seed in range(seeds):
-                world = ("rover-soil", ground)
-                rows.append(row_of(policy, world, (name, "no training", seed), episodes))
-    return rows
+                if (name, UNTRAINED, ground, seed) not in there:
+                    found.append(row_of(policy, ground, (name, UNTRAINED, seed, 0), episodes))
+    return found
+
+
+def kept(path: pathlib.Path) -> pd.DataFrame:
+    """The rows of an existing table."""
+    return pd.read_parquet(path) if path.exists() else pd.DataFrame(columns=COLUMNS)
+
+
+def joined(rows: pd.DataFrame, new: list[dict]) -> pd.DataFrame:
+    """``rows`` and ``new``, which replace rows with the same key."""
+    if not new:
+        return rows
+    both = pd.DataFrame(new) if rows.empty else pd.concat([rows, pd.DataFrame(new)])
+    return both.drop_duplicates(KEY, keep="last").reset_index(drop=True)
 
 
 def pick(rows: pd.DataFrame, algorithm: str, trained_on: str, tested_on: str) -> np.ndarray:
@@ -131,7 +178,7 @@ def text_of(values: np.ndarray) -> str:
 def table(rows: pd.DataFrame, grounds: tuple[str, ...]) -> str:
     """A table for each ground, one of the way back, and the differences that the study is about."""
     parts = []
-    untrained = list(dict.fromkeys(rows[rows["trained_on"] == "no training"]["algorithm"]))
+    untrained = list(dict.fromkeys(rows[rows["trained_on"] == UNTRAINED]["algorithm"]))
     for ground in grounds:
         body = [
             [name, *(text_of(pick(rows, name, source, ground)) for source in (*SLIPS, ground))]
@@ -183,30 +230,29 @@ def differences(rows: pd.DataFrame, grounds: tuple[str, ...], untrained: list[st
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
-    parser.add_argument("--slip-run", type=pathlib.Path, default=pathlib.Path("runs/rover"))
+    parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
     parser.add_argument("--run", type=pathlib.Path, default=pathlib.Path("runs/rover_soil"))
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
     parser.add_argument("--steps", type=int, default=STEPS)
-    parser.add_argument("--report", action="store_true", help="evaluate what there is; no training")
+    parser.add_argument("--sources", nargs="+", choices=SOURCES, default=list(SOURCES), metavar="S")
+    parser.add_argument("--report", action="store_true", help=UNTRAINED)
     options = parser.parse_args(arguments)
-    began, steps, episodes = time.time(), options.steps, EPISODES
+    began, steps, episodes, seeds = time.time(), options.steps, EPISODES, SEEDS
     tiny: dict[str, object] = {}
-    grounds, seeds = GROUNDS, SEEDS
+    grounds = GROUNDS
     if options.quick:
-        steps, episodes, tiny = QUICK_STEPS, QUICK_EPISODES, TINY
-        grounds, seeds = GROUNDS[:1], 1
+        steps, episodes, seeds, tiny = QUICK_STEPS, QUICK_EPISODES, 1, TINY
+        grounds, options.sources = ("mixed",), ["sine-slip", "mixed"]
+    rows = kept(options.out / "rover_soil.parquet")
+    cells = wanted(options.sources, steps, tiny)
     if not options.report:
-        lost = train_on_slip(options.slip_run, steps, tiny)
-        for line in [*lost, *train_on_soil(options.run, steps, tiny)]:
+        for line in train(options.run, cells, rows, seeds, quiet=options.quick):
             print(line, file=sys.stderr)
-    runs = {"rover": options.slip_run, "rover-soil": options.run}
-    found, missing = agents(runs, grounds, seeds, episodes)
-    rows = pd.DataFrame([*found, *controllers(grounds, seeds, episodes)], columns=COLUMNS)
+    found, missing = agents(options.run, cells, rows, seeds, episodes)
+    rows = joined(rows, [*found, *controllers(grounds, rows, seeds, episodes)])
     facts = provenance(
-        steps=steps,
         history_length=HISTORY_LENGTH,
-        **SETTINGS,
+        **{**SETTINGS, "total_steps": steps},
         seeds=seeds,
         episodes_per_seed=episodes,
         missing=len(missing),
