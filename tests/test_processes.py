@@ -1,4 +1,8 @@
-"""Tests of a sweep whose lanes are trained in several processes."""
+"""Tests of a sweep whose lanes are trained in several processes.
+
+The networks are tiny, so that XLA does not divide their sums by the number of cores. Therefore
+threads and processes give the same bits here, unlike with networks of the usual size.
+"""
 
 import os
 import pathlib
@@ -12,10 +16,9 @@ import jax
 import pytest
 
 from rtd3jax import sweep
-from rtd3jax.cli import sweep as command
 from rtd3jax.errors import UserError
 from rtd3jax.study import process_plan, processes, references
-from rtd3jax.study.crew import Crew, NoProcesses
+from rtd3jax.study.crew import Crew
 from rtd3jax.study.lock import is_held
 from rtd3jax.study.log import LOG, read_log
 from rtd3jax.study.plan import Grid, cell_jobs, label, make_cells
@@ -193,8 +196,7 @@ def test_a_simulator_and_an_imported_module_work_in_processes(tmp_path, monkeypa
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        (["--processes", "0"], "neither auto nor a number"),
-        (["--processes", "x"], "neither auto nor a number"),
+        (["--processes", "0"], "must be from 1"),
         (["--processes", "2", "--shard", "1/2"], "choose one of them"),
         (["--processes", "2", "--cluster", "auto"], "choose one of them"),
         (["--processes", "2", "--strategy", "vmap"], "--strategy map"),
@@ -213,39 +215,20 @@ def lanes_of(seeds=4, algorithms=("td3",), **overrides):
     return cell_jobs(cells, range(seeds), "map")
 
 
-def test_auto_chooses_processes_only_where_they_pay(monkeypatch):
+def test_threads_unless_processes_are_asked_for(monkeypatch):
     monkeypatch.setattr(process_plan, "cores", lambda: 2)
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {4, 6})
-    monkeypatch.setattr(process_plan, "core_quota", lambda: None)
-    monkeypatch.setattr(process_plan, "workers", lambda: jax.local_devices() * 2)
     monkeypatch.setattr(process_plan, "memory_limit", lambda: 16 * 2**30)
-    long = lanes_of(algorithms=("lstm-td3",), total_steps=500_000)
+    jobs = lanes_of()
 
-    def chosen(jobs=long, strategy="map", shell=True, asked=None):
-        return process_plan.shares_of(asked, jobs, strategy, shell)
-
-    assert chosen().cores == ((4,), (6,)) and chosen().lanes == 1
-    assert "2 processes, each pinned" in str(chosen())
-    assert chosen(asked=1).processes == 1 and chosen(asked=2).processes == 2
-    for other in (
-        chosen(lanes_of(algorithms=("lstm-td3",), total_steps=5_000)),
-        chosen(long[:1]),
-        chosen(long[:3]),  # one core would be idle for half of the time
-        chosen(strategy="vmap"),
-        chosen(shell=False),
-        chosen([]),
-    ):
-        assert other.processes == 1 and other.reason
-    with monkeypatch.context() as patch:
-        patch.setattr(process_plan, "memory_limit", lambda: 2 * 2**30)
-        assert "memory" in chosen().reason
-        with pytest.raises(UserError, match="GiB"):
-            chosen(asked=2)
-    with monkeypatch.context() as patch:
-        patch.setattr(process_plan, "core_quota", lambda: 1.5)
-        assert "container" in chosen().reason
-    monkeypatch.delattr(os, "sched_setaffinity")
-    assert "pin" in chosen().reason
+    for threads in (process_plan.shares_of(1, jobs, "map"), process_plan.shares_of(2, [], "map")):
+        assert threads.processes == 1 and "a thread per core" in str(threads)
+    two = process_plan.shares_of(2, jobs, "map")
+    assert two.cores == ((4,), (6,)) and two.lanes == 1 and "2 processes, each pinned" in str(two)
+    assert process_plan.shares_of(2, jobs[:1], "map").processes == 1
+    monkeypatch.setattr(process_plan, "memory_limit", lambda: 2**20)
+    with pytest.raises(UserError, match="GiB"):
+        process_plan.shares_of(2, jobs, "map")
 
 
 def test_all_cores_are_divided(monkeypatch):
@@ -253,24 +236,6 @@ def test_all_cores_are_divided(monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {1, 2, 3, 5, 8})
     shares = process_plan._divided(2)
     assert shares.cores == ((1, 2), (3, 5, 8)) and shares.lanes == 3
-
-
-def test_only_the_command_itself_counts_as_a_shells(monkeypatch):
-    """A script that calls it may have registered environments, which new processes lack."""
-    asked = []
-
-    def shares_of(processes, jobs, strategy, shell):
-        asked.append((processes, shell))
-        raise UserError("seen")
-
-    monkeypatch.setattr(command, "shares_of", shares_of)
-    monkeypatch.setattr(sys, "argv", ["sweep", *STUDY, "--out", "nowhere", "--dry-run"])
-    main = sys.modules["__main__"]
-    for spec in (None, type("Spec", (), {"name": "mine"}), type("Spec", (), {"name": COMMAND})):
-        monkeypatch.setattr(main, "__spec__", spec)
-        assert sweep.main() == 2
-    assert run("nowhere", "--dry-run") == 2
-    assert asked == [(None, False), (None, False), (None, True), (None, False)]
 
 
 def test_rows_of_processes_that_write_at_the_same_time_are_of_one_session(tmp_path):
@@ -374,7 +339,7 @@ def test_processes_that_end_at_their_start_are_given_up(study):
         crew.told.put((member, None))
         if attempt < processes._ATTEMPTS - 1:
             made.listen()
-    with pytest.raises(NoProcesses, match="ended at their start"):
+    with pytest.raises(UserError, match="ended at their start"):
         made.listen()
 
 

@@ -21,7 +21,6 @@ from rtd3jax.cli import sweep_options
 from rtd3jax.cli.common import exit_status
 from rtd3jax.errors import UserError
 from rtd3jax.study.cluster import train_on_cluster
-from rtd3jax.study.crew import NoProcesses
 from rtd3jax.study.execute import Work, train_here
 from rtd3jax.study.finish import finish
 from rtd3jax.study.hosts import own_shard, own_share, relaunch
@@ -67,13 +66,7 @@ def _start(options: argparse.Namespace, arguments: Sequence[str] | None) -> int:
         relaunch("rtd3jax.sweep", arguments)
     if options.device:
         jax.config.update("jax_default_device", sweep_options.device(options.device))
-    return _run(options, shell=arguments is None and _is_command())
-
-
-def _is_command() -> bool:
-    """Whether Python runs ``rtd3jax.sweep`` itself, and not a script that calls `main`."""
-    spec = getattr(sys.modules["__main__"], "__spec__", None)
-    return spec is not None and spec.name == "rtd3jax.sweep"
+    return _run(options)
 
 
 class _Terminated(KeyboardInterrupt):
@@ -91,7 +84,7 @@ def _on_termination(handler: Any) -> Any:
     return signal.signal(signal.SIGTERM, handler)
 
 
-def _run(options: argparse.Namespace, shell: bool) -> int:
+def _run(options: argparse.Namespace) -> int:
     if options.status:
         return _status(sweep_options.out(options))
     cells = make_cells(sweep_options.grids(options), sweep_options.overrides(options))
@@ -99,10 +92,10 @@ def _run(options: argparse.Namespace, shell: bool) -> int:
     episodes = sweep_options.count("final_episodes", options.final_episodes)
     strategy = check_strategy(options.strategy)
     check_loggers(options.log)
-    processes = sweep_options.processes(options.processes)
+    processes = sweep_options.count("processes", options.processes)
     divided = options.shard or options.distributed or options.cluster
-    several = processes is not None and processes > 1
-    if sum(map(bool, (options.shard, options.distributed, options.cluster, several))) > 1:
+    ways = options.shard, options.distributed, options.cluster, processes > 1
+    if sum(map(bool, ways)) > 1:
         raise UserError(
             "--processes, --shard, --distributed and --cluster each divide the lanes among "
             "processes: choose one of them"
@@ -114,7 +107,7 @@ def _run(options: argparse.Namespace, shell: bool) -> int:
     additions = "" if options.fresh else directory.plan()
     jobs = directory.jobs(strategy)
     waiting = [job for job in jobs if options.fresh or not directory.lanes.is_done(*job.key)]
-    shares = shares_of(1 if divided else processes, waiting, strategy, shell)
+    shares = shares_of(processes, waiting, strategy)
     if options.dry_run:
         say = functools.partial(print, file=sys.stderr, flush=True)
         print(plan_text(directory.cells, directory.seeds, jobs, strategy, usable_memory(), say))
@@ -146,7 +139,7 @@ def _run(options: argparse.Namespace, shell: bool) -> int:
         if directory.refresh():  # another process has changed the study in the meantime
             jobs = directory.jobs(strategy)
         jobs = _share(jobs, shard, options)
-        trainer = _trainer(options, shares, handles, asked=processes is not None)
+        trainer = _trainer(options, shares, handles)
         return _train(directory, jobs, work, options, trainer)
 
 
@@ -165,31 +158,15 @@ def _share(
     return jobs if shard is None else jobs[shard[0] - 1 :: shard[1]]
 
 
-def _trainer(
-    options: argparse.Namespace, shares: Shares, handles: list[int], *, asked: bool
-) -> Trainer:
-    """The function that trains the lanes: on a cluster, in several processes, or in this one.
-
-    ``asked`` is whether the user has given the number of processes.
-    """
+def _trainer(options: argparse.Namespace, shares: Shares, handles: list[int]) -> Trainer:
+    """The function that trains the lanes: on a cluster, in several processes, or in this one."""
     if options.cluster:
         where = {"address": options.cluster, "imports": options.imports}
         return functools.partial(train_on_cluster, **where)
     if shares.processes == 1:
         return train_here
     where = {"shares": shares, "imports": options.imports, "handles": handles}
-    if asked:
-        return functools.partial(train_in_processes, **where)
-
-    def train_anyway(*arguments: Any) -> None:
-        """Train in processes, which the user has not asked for, if the system lets them start."""
-        try:
-            train_in_processes(*arguments, **where)
-        except NoProcesses as error:
-            print(f"{error}: this process trains the lanes", file=sys.stderr)
-            train_here(*arguments)
-
-    return train_anyway
+    return functools.partial(train_in_processes, **where)
 
 
 def _train(

@@ -87,10 +87,11 @@ def parser(description: str | None) -> argparse.ArgumentParser:
     )
     work.add_argument(
         "--processes",
-        default="auto",
+        type=int,
+        default=1,
         metavar="N",
-        help="train on the CPU in N processes, each pinned to its share of the cores; 1: with "
-        "threads; auto: a process per core if the study is long enough [auto]",
+        help="train on the CPU in N processes, each pinned to its share of the cores; 1: with the "
+        "threads of this process [1]",
     )
     work.add_argument("--shard", metavar="I/N", help="train the I-th of N shares of the lanes")
     work.add_argument(
@@ -199,17 +200,6 @@ def count(name: str, value: int, most: int = 100_000) -> int:
     if not 1 <= value <= most:
         raise UserError(f"{name} must be from 1 to {most:,}, not {value}")
     return value
-
-
-def processes(text: str) -> int | None:
-    """The number of processes; None for ``auto``."""
-    if text.strip() == "auto":
-        return None
-    if not re.fullmatch(r"\s*\d{1,6}\s*", text) or int(text) < 1:
-        raise UserError(
-            f"--processes {text!r} is neither auto nor a number of processes, 1 or more"
-        )
-    return int(text)
 
 
 def device(platform: str) -> Any:

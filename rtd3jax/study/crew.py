@@ -20,10 +20,6 @@ _PATIENCE_SECONDS = 300.0
 """Seconds that processes have to end a chunk or a compilation, and to write checkpoints."""
 
 
-class NoProcesses(UserError):
-    """Processes cannot be started; one process can train the lanes instead."""
-
-
 class Member:
     """A process of the crew.
 
@@ -136,12 +132,12 @@ class Crew:
         """Start a process on these cores.
 
         Raises:
-            NoProcesses: when the system refuses.
+            UserError: when the system refuses.
         """
         try:
             member = Member(cores, self._settings, self._handles, self._messages)
         except OSError as error:
-            raise NoProcesses(
+            raise UserError(
                 f"--processes: a process cannot be started ({error.strerror}); use --processes 1"
             ) from error
         self.members.append(member)

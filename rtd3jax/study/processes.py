@@ -1,10 +1,11 @@
 """Trains the lanes of a study in several processes of this machine.
 
 A process that is pinned to a core trains more steps per second than a thread of a process with all
-cores. This process plans, gives a lane to each process that is free, shows the progress, and
-writes the tables; it computes nothing meanwhile. The processes write the files of their lanes and
-the log, as the tasks of a cluster do. A lane whose process was killed goes on from its checkpoint
-in another process.
+cores. Its sums are rounded differently, because XLA divides sums by the number of cores that a
+process may use. This process plans, gives a lane to each process that is free, shows the progress,
+and writes the tables; it computes nothing meanwhile. The processes write the files of their lanes
+and the log, as the tasks of a cluster do. A lane whose process was killed goes on from its
+checkpoint in another process.
 """
 
 import collections
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from rtd3jax.errors import UserError
-from rtd3jax.study.crew import Crew, Member, NoProcesses
+from rtd3jax.study.crew import Crew, Member
 from rtd3jax.study.derive import Reference
 from rtd3jax.study.execute import Work, waiting_jobs
 from rtd3jax.study.interim import InterimResults
@@ -60,8 +61,7 @@ def train_in_processes(
         handles: the locks of the run directory, which each process holds too.
 
     Raises:
-        NoProcesses: when processes cannot be started.
-        UserError: when a process cannot make an environment, or cannot write.
+        UserError: when a process cannot be started, make an environment, or write.
     """
     waiting = waiting_jobs(directory, jobs)
     if not waiting:
@@ -150,7 +150,7 @@ class _Study:
             if message is None:
                 self._replace(member)
             elif "error" in message:
-                raise (UserError if member.ready else NoProcesses)(message["error"])
+                raise UserError(message["error"])
             elif "ended" in message:
                 self.left -= len(member.lanes)
                 member.lanes = []
@@ -172,7 +172,7 @@ class _Study:
         if not member.ready:
             self._failed_starts += 1
             if self._failed_starts == _ATTEMPTS:
-                raise NoProcesses(
+                raise UserError(
                     f"--processes: {_ATTEMPTS} processes ended at their start ({how}); "
                     "use --processes 1"
                 )

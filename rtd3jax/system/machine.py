@@ -53,23 +53,6 @@ def _physical_on_windows() -> int:
         return 8 * 2**30  # unknown: a usual size is assumed
 
 
-def core_quota() -> float | None:
-    """Cores whose time the containers of this process allow it; None without such a limit.
-
-    A process may run on every core of `cores`, but is stopped when it has used this time.
-    """
-    found = []
-    for group, unified in _own_cgroups("cpu"):
-        if unified:
-            with contextlib.suppress(OSError, ValueError):  # "max" has no number
-                quota, period = map(int, (group / "cpu.max").read_text(encoding="utf-8").split())
-                found.append(quota / period)
-        else:
-            numbers = (_number(group / f"cpu.cfs_{name}_us") for name in ("quota", "period"))
-            found += [q / p for q, p in zip(*numbers, strict=False) if q > 0]  # -1: no limit
-    return min(found, default=None)
-
-
 def _cgroup_limits() -> list[int]:
     """Limits of containers and batch systems: of this cgroup (v1 or v2) and all its parents."""
     found = []
