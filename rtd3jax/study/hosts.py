@@ -3,7 +3,8 @@
 Lanes are independent, so the processes exchange nothing during training. Each of the D devices of
 the job gets every D-th lane. A process trains the lanes of its own devices and writes their files;
 the process that ends last writes the tables of all lanes. The results of a lane do not depend on
-its device.
+which device trains it, if the devices are equal and, on CPUs, each process may use the same number
+of cores; otherwise they differ by rounding.
 """
 
 import os

@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 _CGROUP = Path("/sys/fs/cgroup")
@@ -56,28 +55,22 @@ def _physical_on_windows() -> int:
 def _cgroup_limits() -> list[int]:
     """Limits of containers and batch systems: of this cgroup (v1 or v2) and all its parents."""
     found = []
-    for group, unified in _own_cgroups("memory"):
-        found += _number(group / ("memory.max" if unified else "memory.limit_in_bytes"))
-    return found
-
-
-def _own_cgroups(controller: str) -> Iterator[tuple[Path, bool]]:
-    """Directories of this process's cgroups and their parents, each with whether it is of v2."""
     with contextlib.suppress(OSError, ValueError):
         for line in _OWN_CGROUPS.read_text(encoding="utf-8").splitlines():
             _, controllers, path = line.split(":", 2)
             if controllers == "":
-                root = _CGROUP
-            elif controller in controllers.split(","):
-                root = _CGROUP / controller
+                root, name = _CGROUP, "memory.max"
+            elif "memory" in controllers.split(","):
+                root, name = _CGROUP / "memory", "memory.limit_in_bytes"
             else:
                 continue
             group = root / path.strip("/")
             # In a container, the path may be the host's, which is not visible; the root is.
             for directory in (group, *group.parents):
-                yield directory, root == _CGROUP
+                found += _number(directory / name)
                 if directory == root:
                     break
+    return found
 
 
 def _number(file: Path) -> list[int]:

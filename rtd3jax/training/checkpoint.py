@@ -1,9 +1,11 @@
-"""Checkpoints of lanes, from which training continues with bit-identical results.
+"""Checkpoints of lanes, from which training continues as if it had not been interrupted.
 
 A checkpoint of a lane is one safetensors file with a checksum; reading it cannot run code. The file
 is written under a temporary name and then renamed, and the last two are kept. A lane has no state
 outside the checkpoint: its random numbers are a function of seed and step, and the division of its
-steps into chunks has no effect. So a lane that continues from a checkpoint ends with the same bits.
+steps into chunks has no effect. So a lane that continues from a checkpoint ends with the same bits,
+if the process may use the same number of cores on the same kind of processor: XLA divides long sums
+by this number. Otherwise it differs by rounding.
 """
 
 import hashlib
@@ -239,7 +241,7 @@ def named_numbers(leaf: ArrayLike) -> Any:
 
 
 def versions() -> dict[str, str]:
-    """Versions of the packages that determine a lane's results bit by bit."""
+    """Versions of the packages, which also determine a lane's results."""
     return versions_of(("rtd3jax", "jax", "jaxlib"))
 
 

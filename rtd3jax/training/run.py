@@ -155,10 +155,10 @@ def train(
         params: the environment's parameters; its default parameters by default.
         progress: whether to show a progress bar.
         checkpoint_dir: directory for checkpoints. If you repeat the call, training continues from
-            them, with bit-identical results; seeds that have ended are not trained again, unless
-            ``total_steps`` is larger now. With several configurations, each has a subdirectory,
-            ``config-0``, ``config-1``, ... Without checkpoints, the training is lost if the process
-            is killed.
+            them, with bit-identical results on the same number of cores; seeds that have ended are
+            not trained again, unless ``total_steps`` is larger now. With several configurations,
+            each has a subdirectory, ``config-0``, ``config-1``, ... Without checkpoints, the
+            training is lost if the process is killed.
         checkpoint_seconds: time between two checkpoints of a lane; by default five minutes, or
             longer if checkpoints would take more than 2% of the time.
         start: networks from which training starts: a `Policy`, a `Run` with the same seeds, the
