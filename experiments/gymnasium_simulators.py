@@ -8,7 +8,7 @@ each and the same settings; the difference of the means has a 95% interval (Welc
 30,000 steps. `cheetah`: the same agents on HalfCheetah-v5 with hidden velocities, one seed each,
 100,000 steps. `cost`: milliseconds of a step of `td3` on Pendulum-v1, minus those of the simulator
 alone and of the same agent on the pendulum of this package. The script writes
-gymnasium_simulators.md, .parquet and .json; existing rows are kept.
+gymnasium_simulators.md, .parquet, .json and .png; existing rows are kept.
 """
 
 import argparse
@@ -20,9 +20,11 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 from scipy import stats
 
 import rtd3jax as rtd
+from rtd3jax.study.colours import colour_of
 from rtd3jax.study.presets import PENDULUM_SETTINGS
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
@@ -147,6 +149,9 @@ def main(arguments: list[str] | None = None) -> int:
             pd.DataFrame(rows).to_parquet(path, index=False)
             print(own, [round(row["mean"], 1) for row in rows if row["environment"] == name])
     table = pd.DataFrame(rows)
+    if "curve" in table:
+        options.out.mkdir(parents=True, exist_ok=True)
+        draw(table[table["task"] != "cost"], options.out / "gymnasium_simulators.png")
     text = report(table)
     setting = {**SETTING, "other fields": OWN}
     write_results(
@@ -158,6 +163,27 @@ def main(arguments: list[str] | None = None) -> int:
     )
     print(text)
     return 0
+
+
+def draw(lanes: pd.DataFrame, path: pathlib.Path) -> None:
+    """Draw the learning curves of the simulators: a panel for each, a line for each seed."""
+    names = list(dict.fromkeys(lanes["environment"]))
+    figure = Figure(figsize=(3.0 * len(names), 2.6), layout="constrained")
+    panels = figure.subplots(1, len(names), squeeze=False)[0]
+    for axes, name in zip(panels, names, strict=True):
+        for algorithm, own in lanes[lanes["environment"] == name].groupby("algorithm"):
+            for place, (curve, steps) in enumerate(zip(own["curve"], own["steps"], strict=True)):
+                axes.plot(
+                    steps * np.arange(1, len(curve) + 1) / len(curve) / 1_000,
+                    curve,
+                    color=colour_of(algorithm),
+                    label=algorithm if place == 0 else None,
+                )
+        axes.set_title(name, fontsize=9)
+        axes.set_xlabel("thousand steps", fontsize=9)
+        axes.legend(fontsize=7)
+    panels[0].set_ylabel("return", fontsize=9)
+    figure.savefig(path, dpi=150)
 
 
 def report(table: pd.DataFrame) -> str:

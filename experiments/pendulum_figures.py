@@ -179,7 +179,8 @@ def generalisation(moved: pd.DataFrame) -> Figure | None:
         here = moved[moved["history_length"].isin([0, length])]
         _bars(axes, here, "tested_on", conditions, agents_in(moved))
         axes.set_ylabel(f"l = {length}\nnormalised return", fontsize=9)
-    panels[0].legend(fontsize=7, ncols=3, loc="lower left")
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, fontsize=7, ncols=3, loc="outside upper center")
     return figure
 
 
