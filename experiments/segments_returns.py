@@ -53,10 +53,19 @@ PENDULUM = {**presets.PENDULUM_SETTINGS, "total_steps": presets.PENDULUM_STEPS}
 SEGMENTS: dict[str, Any] = {"replay": "segments"}
 CHOSEN: dict[tuple[str, int], dict[str, Any]] = {
     ("rover", 6): {**SEGMENTS, "batch_size": 200, "segment_length": 10, "burn_in_gradient": False},
-    **dict.fromkeys(
-        (("pendulum", 6), ("pendulum", 20)),
-        {**SEGMENTS, "batch_size": 100, "segment_length": 10, "burn_in_gradient": False},
-    ),
+    ("pendulum", 6): {
+        **SEGMENTS,
+        "batch_size": 100,
+        "segment_length": 10,
+        "burn_in_gradient": False,
+    },
+    ("pendulum", 20): {
+        **SEGMENTS,
+        "batch_size": 160,
+        "segment_length": 10,
+        "burn_in_gradient": False,
+        "actor_noise": 0.1,
+    },
 }
 """Of the candidates, by environment and history length."""
 
@@ -105,6 +114,7 @@ CANDIDATES: dict[tuple[str, int], list[Candidate]] = {
         Candidate(200, 10, False, "carry", {"update_every": 4}),
         Candidate(100, 10, False, "carry", {"critic_learning_rate": 1e-3}),
         Candidate(100, 10, False, "carry", {"actor_noise": 0.1}),
+        Candidate(160, 10, False, "carry", {"actor_noise": 0.1}),
     ],
     ("rover", 6): [Candidate(200, 10, False, "carry")],
 }
