@@ -150,8 +150,8 @@ class Config:
         default=False,
         metadata={
             "help": "whether the gradient of a segment flows into its burn-in, the history_length "
-            "steps before it; this took more time and did not raise returns "
-            "(experiments/segments_returns.py)"
+            "steps before it; with segments of ten, this took more time and did not raise returns "
+            "(experiments/results/segments_search.csv)"
         },
     )
     acting: Acting | None = dataclasses.field(
