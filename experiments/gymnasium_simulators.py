@@ -48,12 +48,14 @@ TASKS: dict[str, list[tuple[str, dict[str, Any], int, dict[str, Any]]]] = {
         ("HalfCheetah-v5", {"keep": range(8)}, 1, {**FEED_FORWARD, "total_steps": 100_000}),
     ],
 }
+DEFAULTS = {name: getattr(rtd.Config(), name) for name in SETTING if not name.startswith("eval")}
+"""The fields of the pendulum's setting, but with the values of the published TD3."""
 OWN = {
     # An episode ends at an angle of 0.2 rad: raw readings are too small for a network. Values reach
     # their level within thousands of updates; still, one of four seeds failed in
     # experiments/gymnasium_search.py.
     "InvertedPendulum-v5": {
-        **{name: getattr(rtd.Config(), name) for name in SETTING if not name.startswith("eval")},
+        **DEFAULTS,
         "hidden_size": 64,
         "gamma": 0.95,
         "tau": 0.02,
@@ -62,7 +64,7 @@ OWN = {
     },
     # TD3's usual settings of this simulator, with a smaller reward.
     "HalfCheetah-v5": {
-        **{name: getattr(rtd.Config(), name) for name in SETTING if not name.startswith("eval")},
+        **DEFAULTS,
         "learning_starts": 10_000,
         "reward_scale": 0.1,
     },

@@ -26,7 +26,6 @@ from rtd3jax.study.report import data
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.training.lanes import make_groups
 
-COMMAND = "rtd3jax.sweep"
 STEPS, SEEDS = 4_000, 3
 STUDY = [
     *("--env", "rover", "--disturbances", "ar1-slip", "--algorithms", "td3"),
@@ -197,6 +196,7 @@ def test_a_simulator_and_an_imported_module_work_in_processes(tmp_path, monkeypa
     ("more", "message"),
     [
         (["--processes", "0"], "must be from 1"),
+        (["--processes", "x"], "invalid int value: 'x'"),
         (["--processes", "2", "--shard", "1/2"], "choose one of them"),
         (["--processes", "2", "--cluster", "auto"], "choose one of them"),
         (["--processes", "2", "--strategy", "vmap"], "--strategy map"),

@@ -28,6 +28,8 @@ import numpy as np
 import pandas as pd
 import torch
 
+from experiments.searching import go_through
+
 RESULTS = pathlib.Path(__file__).parents[1] / "results" / "benchmarks"
 SEEDS, STEPS, EPISODES, RANDOM_STEPS, KEEP = 3, 30_000, 100, 1_000, (0, 1)
 LIMIT = 1_000
@@ -113,7 +115,6 @@ def trained(code: Any, seed: int, steps: int, episodes: int) -> dict[str, object
             logger_kwargs={"output_dir": folder},
         )
     return {
-        "seed": seed,
         "steps": steps,
         "mean": float(np.mean(Logger.returns)),
         "cpu_seconds": round(time.process_time() - began, 1),
@@ -135,15 +136,13 @@ def main(arguments: list[str] | None = None) -> int:
     code = published(options.checkout)
     git = ["git", "-C", str(options.checkout), "rev-parse", "--short", "HEAD"]
     commit = subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
-    rows = pd.read_csv(options.out).to_dict("records") if options.out.exists() else []
-    for seed in range(seeds):
-        if any(row["seed"] == seed for row in rows):
-            continue
-        rows.append({**trained(code, seed, steps, episodes), "commit": commit})
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        pd.DataFrame(rows).to_csv(options.out, index=False)
-        print(rows[-1], flush=True)
-    means = pd.DataFrame(rows)["mean"]
+    go_through(
+        ({"seed": seed} for seed in range(seeds)),
+        lambda setting: {**trained(code, setting["seed"], steps, episodes), "commit": commit},
+        options.out,
+        {"seed": 0},
+    )
+    means = pd.read_csv(options.out)["mean"]
     print(f"{means.mean():.1f} ± {means.std():.1f}")
     return 0
 

@@ -22,6 +22,8 @@ import pandas as pd
 import torch
 from sb3_contrib import RecurrentPPO
 
+from experiments.searching import go_through
+
 RESULTS = pathlib.Path(__file__).parents[1] / "results" / "benchmarks"
 SEEDS, STEPS, EPISODES, KEEP = 3, 30_000, 100, (0, 1)
 
@@ -58,7 +60,6 @@ def trained(seed: int, steps: int, episodes: int) -> dict[str, object]:
     model.learn(steps)
     seconds = time.process_time() - began
     return {
-        "seed": seed,
         "steps": model.num_timesteps,
         "mean": float(np.mean(tested(model, episodes, seed))),
         "cpu_seconds": round(seconds, 1),
@@ -74,15 +75,13 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     seeds, steps, episodes = (1, 128, 2) if options.quick else (SEEDS, STEPS, EPISODES)
     torch.set_num_threads(1)
-    rows = pd.read_csv(options.out).to_dict("records") if options.out.exists() else []
-    for seed in range(seeds):
-        if any(row["seed"] == seed for row in rows):
-            continue
-        rows.append(trained(seed, steps, episodes))
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        pd.DataFrame(rows).to_csv(options.out, index=False)
-        print(rows[-1], flush=True)
-    means = pd.DataFrame(rows)["mean"]
+    go_through(
+        ({"seed": seed} for seed in range(seeds)),
+        lambda setting: trained(setting["seed"], steps, episodes),
+        options.out,
+        {"seed": 0},
+    )
+    means = pd.read_csv(options.out)["mean"]
     print(f"{means.mean():.1f} ± {means.std():.1f}")
     return 0
 

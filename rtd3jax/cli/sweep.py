@@ -93,9 +93,8 @@ def _run(options: argparse.Namespace) -> int:
     strategy = check_strategy(options.strategy)
     check_loggers(options.log)
     processes = sweep_options.count("processes", options.processes)
-    divided = options.shard or options.distributed or options.cluster
-    ways = options.shard, options.distributed, options.cluster, processes > 1
-    if sum(map(bool, ways)) > 1:
+    divided = options.shard, options.distributed, options.cluster
+    if sum(map(bool, (*divided, processes > 1))) > 1:
         raise UserError(
             "--processes, --shard, --distributed and --cluster each divide the lanes among "
             "processes: choose one of them"
@@ -111,7 +110,7 @@ def _run(options: argparse.Namespace) -> int:
     if options.dry_run:
         say = functools.partial(print, file=sys.stderr, flush=True)
         print(plan_text(directory.cells, directory.seeds, jobs, strategy, usable_memory(), say))
-        if not divided:
+        if not any(divided):
             print(f"trained by {shares}")
         print(additions, end="\n" if additions else "")
         return 0
