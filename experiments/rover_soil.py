@@ -6,12 +6,11 @@ Usage: python experiments/rover_soil.py [--quick] [--run DIR] [--out DIR] [--ste
 Six agents, five seeds, are trained under the rover's sine and AR(1) slip, and with the same setting
 on each ground. Beside them stand controllers that need no training. Every policy is tested in 1,000
 episodes: those of the slips on each ground, and those of a ground there and under both slips. The
-script writes rover_soil.md, rover_soil.parquet (a row per policy and world) and rover_soil.json. It
+script writes rover_soil.md, rover_soil.parquet (a row per policy and world), rover_soil.json, and a
+picture (experiments/rover_soil_report.py). It
 trains the cells that the table does not have yet, as a study in DIR, in the order of `SOURCES`; if
 you repeat the command, also on another machine, it only trains what is missing. `--report` does not
 train: it tests what DIR has so far, also of a study that has not ended.
-
-Intervals are 95% bootstrap intervals over seeds (10,000 resamples, fixed random numbers).
 """
 
 import argparse
@@ -30,12 +29,10 @@ from rtd3jax.study.presets import ROVER_SETTINGS as SETTINGS
 from rtd3jax.study.presets import ROVER_STEPS as STEPS
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-from claims import RESAMPLES, ROVER_MARGIN, Effect  # noqa: E402
 from rover import EPISODES, PAPER_EPISODES, SEEDS  # noqa: E402
-from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
+from rover_soil_report import GROUNDS, SLIPS, UNTRAINED, draw, tables  # noqa: E402
+from writing import RESULTS, provenance, write_results  # noqa: E402
 
-SLIPS = ("ar1-slip", "sine-slip")
-GROUNDS = ("dry-sand", "mixed", "mixed-slope")
 SOURCES = ("sine-slip", "ar1-slip", "mixed", "dry-sand", "mixed-slope")
 """What agents are trained on, in an order that soon gives a useful table."""
 TINY = {"hidden_size": 4, "batch_size": 4, "learning_starts": 10}
@@ -43,7 +40,6 @@ TINY |= {"eval_every": 60, "eval_episodes": 1}
 QUICK_STEPS, QUICK_EPISODES = 60, 20
 KEY = ["algorithm", "trained_on", "tested_on", "seed"]
 COLUMNS = [*KEY, "steps", "episodes", "mean", "standard_error"]
-UNTRAINED = "no training"
 
 
 def world(name: str) -> tuple[str, str]:
@@ -152,82 +148,6 @@ def joined(rows: pd.DataFrame, new: list[dict]) -> pd.DataFrame:
     return both.drop_duplicates(KEY, keep="last").reset_index(drop=True)
 
 
-def pick(rows: pd.DataFrame, algorithm: str, trained_on: str, tested_on: str) -> np.ndarray:
-    """Mean return of each seed."""
-    here = rows[
-        (rows["algorithm"] == algorithm)
-        & (rows["trained_on"] == trained_on)
-        & (rows["tested_on"] == tested_on)
-    ]
-    return here["mean"].to_numpy()
-
-
-def text_of(values: np.ndarray) -> str:
-    """Mean over seeds with its interval."""
-    if not len(values):
-        return "not trained yet"
-    if len(values) == 1:
-        return f"{values[0]:.2f} (1 of {SEEDS} seeds)"
-    random = np.random.default_rng(0)
-    means = values[random.integers(0, len(values), (RESAMPLES, len(values)))].mean(axis=1)
-    low, high = np.quantile(means, (0.025, 0.975))
-    count = "" if len(values) == SEEDS else f" ({len(values)} of {SEEDS} seeds)"
-    return f"{values.mean():.2f} [{low:.2f}, {high:.2f}]{count}"
-
-
-def table(rows: pd.DataFrame, grounds: tuple[str, ...]) -> str:
-    """A table for each ground, one of the way back, and the differences that the study is about."""
-    parts = []
-    untrained = list(dict.fromkeys(rows[rows["trained_on"] == UNTRAINED]["algorithm"]))
-    for ground in grounds:
-        body = [
-            [name, *(text_of(pick(rows, name, source, ground)) for source in (*SLIPS, ground))]
-            for name in rtd.ALGORITHMS
-        ]
-        body += [
-            [f"*{name}*", "", "", text_of(pick(rows, name, "no training", ground))]
-            for name in untrained
-        ]
-        header = ["agent", *(f"trained on {slip}" for slip in SLIPS), "trained here, or not at all"]
-        parts.append(f"Tested on `{ground}`:\n\n{markdown_table(header, body)}")
-    header = ["agent", *(f"{ground} → {slip}" for ground in grounds for slip in SLIPS)]
-    body = [
-        [name, *(text_of(pick(rows, name, g, slip)) for g in grounds for slip in SLIPS)]
-        for name in rtd.ALGORITHMS
-    ]
-    parts.append(f"The way back, to the rover's slips:\n\n{markdown_table(header, body)}")
-    return "\n\n".join([*parts, differences(rows, grounds, untrained)])
-
-
-def differences(rows: pd.DataFrame, grounds: tuple[str, ...], untrained: list[str]) -> str:
-    """What training on the ground gains over each slip, and over the best controller there."""
-    body = []
-    for ground in grounds:
-        controllers_here = {name: pick(rows, name, "no training", ground) for name in untrained}
-        best = max(controllers_here, key=lambda name: controllers_here[name].mean())
-        for name in rtd.ALGORITHMS:
-            there = pick(rows, name, ground, ground)
-            effects = [
-                Effect(
-                    f"{name}: trained here over {slip}",
-                    there,
-                    pick(rows, name, slip, ground),
-                    ROVER_MARGIN,
-                )
-                for slip in SLIPS
-            ]
-            effects += [
-                Effect(
-                    f"{name}, {slip} over {best}", transferred, controllers_here[best], ROVER_MARGIN
-                )
-                for slip in SLIPS
-                if len(transferred := pick(rows, name, slip, ground))
-            ]
-            body += [[ground, effect.text(), effect.verdict()] for effect in effects]
-    header = ["ground", "difference of means [95% interval]", "that it is positive"]
-    return markdown_table(header, body)
-
-
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
@@ -258,8 +178,9 @@ def main(arguments: list[str] | None = None) -> int:
         missing=len(missing),
         minutes_of_the_last_call=round((time.time() - began) / 60, 1),
     )
-    text = table(rows, grounds)
+    text = tables(rows, grounds, seeds)
     write_results(options.out, "rover_soil", rows, text, facts)
+    draw(rows, grounds, options.out)
     print(text)
     for line in missing:
         print(f"missing: {line}")

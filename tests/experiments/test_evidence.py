@@ -67,6 +67,30 @@ def test_the_rover_on_soil_meets_agents_of_the_rover(tmp_path, capsys):
     pd.testing.assert_frame_equal(again, rows)
 
 
+def test_the_report_of_the_rover_on_soil(tmp_path):
+    report = load(EXPERIMENTS / "rover_soil_report.py")
+    ways = [("sine-slip", "mixed", -1.0), ("ar1-slip", "mixed", -0.5), ("mixed", "mixed", -0.1)]
+    rows = [
+        {"algorithm": agent, "trained_on": there, "tested_on": here, "seed": s, "mean": mean * k}
+        for k, agent in enumerate(("lstm-td3-1ha1hc", "td3"), start=1)
+        for there, here, mean in ways
+        for s in range(3)
+    ]
+    rows += [
+        {"algorithm": name, "trained_on": "no training", "tested_on": "mixed", "seed": s, "mean": m}
+        for name, m in (("feed-forward and PI", -0.2), ("adaptive slip estimate", -0.3))
+        for s in range(3)
+    ]
+    rows = pd.DataFrame(rows)
+    text = report.tables(rows, ("mixed",), 3)
+    assert "| td3 | -1.000 [-1.000, -1.000] | -2.000 [-2.000, -2.000] | -0.200" in text
+    assert "| mixed | undecided | over td3: +1.000 [+1.000, +1.000]; over lstm-td3: too few" in text
+    assert "| mixed | td3: here over sine-slip: +1.800 [+1.800, +1.800] | supported |" in text
+    assert "td3: sine-slip over feed-forward and PI: -1.800" in text
+    report.draw(rows, ("mixed",), tmp_path)
+    assert (tmp_path / "rover_soil.png").read_bytes().startswith(b"\x89PNG")
+
+
 def test_the_cost_of_a_step_on_soil_is_said(capsys):
     load(EXPERIMENTS / "rover_soil_cost.py").main(["--quick"])
     assert "rover-soil mixed-slope: step_env" in capsys.readouterr().out

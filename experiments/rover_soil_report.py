@@ -1,0 +1,154 @@
+"""The tables and the picture of experiments/rover_soil.py, from its rows.
+
+Intervals are 95% bootstrap intervals over seeds (10,000 resamples, fixed random numbers). A return
+is minus the sum of squared errors of a drive. The picture shows returns with the sign changed, on a
+logarithmic axis: a lower point is a better policy.
+"""
+
+import pathlib
+import sys
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+import rtd3jax as rtd
+
+sys.path.insert(0, str(pathlib.Path(__file__).parent))
+from claims import BEST, RESAMPLES, ROVER_MARGIN, Effect, combine  # noqa: E402
+from writing import markdown_table  # noqa: E402
+
+SLIPS = ("ar1-slip", "sine-slip")
+GROUNDS = ("dry-sand", "mixed", "mixed-slope")
+UNTRAINED = "no training"
+"""What controllers are trained on."""
+TRANSFER_SLIP = "sine-slip"
+"""The training of the paper's claim 14."""
+COLOURS = {"ar1-slip": "#56B4E9", "sine-slip": "#E69F00", "here": "#009E73"}
+CONTROLLER_LINES = {"feed-forward and PI": "-", "adaptive slip estimate": "--"}
+
+
+def pick(rows: pd.DataFrame, algorithm: str, trained_on: str, tested_on: str) -> np.ndarray:
+    """Mean return of each seed."""
+    here = rows[
+        (rows["algorithm"] == algorithm)
+        & (rows["trained_on"] == trained_on)
+        & (rows["tested_on"] == tested_on)
+    ]
+    return here["mean"].to_numpy()
+
+
+def text_of(values: np.ndarray, seeds: int) -> str:
+    """Mean over seeds with its interval."""
+    if not len(values):
+        return "not trained yet"
+    count = "" if len(values) == seeds else f" ({len(values)} of {seeds} seeds)"
+    if len(values) == 1:
+        return f"{values[0]:.3f}{count}"
+    random = np.random.default_rng(0)
+    means = values[random.integers(0, len(values), (RESAMPLES, len(values)))].mean(axis=1)
+    low, high = np.quantile(means, (0.025, 0.975))
+    return f"{values.mean():.3f} [{low:.3f}, {high:.3f}]{count}"
+
+
+def untrained(rows: pd.DataFrame) -> list[str]:
+    """The controllers that need no training, in the order of the table."""
+    return list(dict.fromkeys(rows[rows["trained_on"] == UNTRAINED]["algorithm"]))
+
+
+def returns_on(rows: pd.DataFrame, ground: str, seeds: int) -> str:
+    """The return of every agent and controller on a ground."""
+
+    def entry(name: str, source: str) -> str:
+        return text_of(pick(rows, name, source, ground), seeds)
+
+    header = ["agent", *(f"trained on {slip}" for slip in SLIPS), "trained here, or not at all"]
+    body = [[a, *(entry(a, source) for source in (*SLIPS, ground))] for a in rtd.ALGORITHMS]
+    body += [[f"*{name}*", "", "", entry(name, UNTRAINED)] for name in untrained(rows)]
+    return f"Tested on `{ground}`:\n\n{markdown_table(header, body)}"
+
+
+def way_back(rows: pd.DataFrame, grounds: tuple[str, ...], seeds: int) -> str:
+    """The return of the agents of each ground under the rover's slips."""
+    ways = [(ground, slip) for ground in grounds for slip in SLIPS]
+    header = ["agent", *(f"{ground} → {slip}" for ground, slip in ways)]
+    body = [[a, *(text_of(pick(rows, a, *way), seeds) for way in ways)] for a in rtd.ALGORITHMS]
+    return f"The way back, to the rover's slips:\n\n{markdown_table(header, body)}"
+
+
+def difference(name: str, better: np.ndarray, worse: np.ndarray) -> Effect:
+    """A difference of returns, with the margin of the rover."""
+    return Effect(name, better, worse, ROVER_MARGIN)
+
+
+def claim_14(rows: pd.DataFrame, grounds: tuple[str, ...]) -> str:
+    """The paper's claim 14 on each ground: of the agents of sine slip, `BEST` transfers best."""
+    body = []
+    for ground in grounds:
+        best = pick(rows, BEST, TRANSFER_SLIP, ground)
+        effects = [
+            difference(f"over {name}", best, pick(rows, name, TRANSFER_SLIP, ground))
+            for name in rtd.ALGORITHMS
+            if name != BEST
+        ]
+        texts = "; ".join(effect.text() for effect in effects)
+        body.append([ground, combine([effect.verdict() for effect in effects]), texts])
+    header = ["ground", "verdict", f"`{BEST}`, trained on {TRANSFER_SLIP}"]
+    return f"The paper's claim 14, on soil:\n\n{markdown_table(header, body)}"
+
+
+def against(rows: pd.DataFrame, grounds: tuple[str, ...]) -> str:
+    """What training on the ground gains over each slip, and each slip over the best controller."""
+    body = []
+    for ground in grounds:
+        plain = {name: pick(rows, name, UNTRAINED, ground) for name in untrained(rows)}
+        best = max(plain, key=lambda name: plain[name].mean())
+        for name in rtd.ALGORITHMS:
+            of = {source: pick(rows, name, source, ground) for source in (*SLIPS, ground)}
+            effects = [
+                *(difference(f"{name}: here over {s}", of[ground], of[s]) for s in SLIPS),
+                *(difference(f"{name}: {s} over {best}", of[s], plain[best]) for s in SLIPS),
+                difference(f"{name}: here over {best}", of[ground], plain[best]),
+            ]
+            there = [e for e in effects if len(e.better) and len(e.worse)]
+            body += [[ground, effect.text(), effect.verdict()] for effect in there]
+    header = ["ground", "difference of means [95% interval]", "that it is positive"]
+    return markdown_table(header, body)
+
+
+def tables(rows: pd.DataFrame, grounds: tuple[str, ...], seeds: int) -> str:
+    """A table for each ground, the way back, claim 14, and the differences."""
+    parts = [returns_on(rows, ground, seeds) for ground in grounds]
+    parts += [way_back(rows, grounds, seeds), claim_14(rows, grounds), against(rows, grounds)]
+    return "\n\n".join(parts)
+
+
+def draw(rows: pd.DataFrame, grounds: tuple[str, ...], out: pathlib.Path) -> None:
+    """Draw the cost of each agent and controller, a panel for each ground, as rover_soil.png."""
+    figure = Figure(figsize=(3.4 * len(grounds) + 1.0, 3.8), layout="constrained")
+    panels = figure.subplots(1, len(grounds), sharey=True, squeeze=False)[0]
+    for axes, ground in zip(panels, grounds, strict=True):
+        for k, (label, colour) in enumerate(COLOURS.items()):
+            source = ground if label == "here" else label
+            for i, name in enumerate(rtd.ALGORITHMS):
+                costs = -pick(rows, name, source, ground)
+                at = np.full(len(costs), i + 0.24 * (k - 1))
+                axes.plot(at, costs, "o", color=colour, markersize=3.5, alpha=0.8)
+            axes.plot(
+                [],
+                [],
+                "o",
+                color=colour,
+                label=f"trained {'' if label == 'here' else 'on '}{label}",
+            )
+        for name, style in CONTROLLER_LINES.items():
+            cost = -pick(rows, name, UNTRAINED, ground).mean()
+            axes.axhline(cost, color="#777777", linestyle=style, linewidth=1, label=name)
+        axes.set_yscale("log")
+        axes.set_title(f"on {ground}")
+        axes.set_xticks(range(len(rtd.ALGORITHMS)), rtd.ALGORITHMS, rotation=40, ha="right")
+        axes.grid(axis="y", alpha=0.3)
+    panels[0].set_ylabel("minus the return (lower is better)")
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(handles), fontsize=8)
+    figure.savefig(out / "rover_soil.png", dpi=150)
