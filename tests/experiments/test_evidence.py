@@ -3,11 +3,15 @@
 import shutil
 import sys
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
 from test_reliability import EXPERIMENTS, load
 
+from rtd3jax.envs.rover_soil.soil import Soil, local_soil
+from rtd3jax.envs.rover_soil.wheel import contact_forces, entry_angle
 from rtd3jax.study import references
 
 
@@ -96,11 +100,26 @@ def test_the_cost_of_a_step_on_soil_is_said(capsys):
     assert "rover-soil mixed-slope: step_env" in capsys.readouterr().out
 
 
+def test_the_prediction_of_a_pull_is_that_of_the_rover_on_soil():
+    experiment = load(EXPERIMENTS / "rover_soil_pull.py")
+    published = experiment.PUBLISHED
+    soil = Soil(*published[:3], 15.6e3, 2407.4e3, published.exponent, *published[5:8])
+    local = jax.tree.map(lambda part: jnp.full((6,), part), local_soil(soil, 0.165))
+    slip, load_ = jnp.asarray(experiment.SLIP, jnp.float32), jnp.full((6,), experiment.LOAD)
+    entry = entry_angle(local, experiment.WHEEL, load_, slip)
+    found = contact_forces(local, experiment.WHEEL, entry, slip)
+    pull, torque, sinkage = experiment.prediction(np.array(published))
+    np.testing.assert_allclose(pull, found.pull, atol=0.01)
+    np.testing.assert_allclose(torque, found.torque, rtol=1e-3)
+    np.testing.assert_allclose(sinkage, 0.15735 * (1 - np.cos(entry)), rtol=1e-3)
+
+
 @pytest.mark.parametrize(
     "name",
     [
         "slip_distributions",
         "parameter_counts",
+        "rover_soil_pull",
         "sizing",
         pytest.param("filter_reference", marks=pytest.mark.slow),
         pytest.param("memories", marks=pytest.mark.slow),
