@@ -4,13 +4,13 @@ Usage: python experiments/rover_soil.py [--quick] [--run DIR] [--out DIR] [--ste
                                         [--sources S ...] [--report]
 
 Six agents, five seeds, are trained under the rover's sine and AR(1) slip, and with the same setting
-on each ground. Beside them stand controllers that need no training. Every policy is tested in 1,000
-episodes: those of the slips on each ground, and those of a ground there and under both slips. The
-script writes rover_soil.md, rover_soil.parquet (a row per policy and world), rover_soil.json, and a
-picture (experiments/rover_soil_report.py). It
-trains the cells that the table does not have yet, as a study in DIR, in the order of `SOURCES`; if
-you repeat the command, also on another machine, it only trains what is missing. `--report` does not
-train: it tests what DIR has so far, also of a study that has not ended.
+on soil (`mixed`). Beside them stand controllers that need no training. Every policy is tested in
+1,000 episodes of each ground; those of soil also under both slips. The script writes rover_soil.md,
+rover_soil.parquet (a row per policy and world), rover_soil.json, and a picture
+(experiments/rover_soil_report.py). It trains the cells that the table does not have yet, as a study
+in DIR, in the order of `SOURCES`; if you repeat the command, also on another machine, it only
+trains what is missing. `--report` does not train: it tests what DIR has so far, also of a study
+that has not ended.
 """
 
 import argparse
@@ -30,10 +30,10 @@ from rtd3jax.study.presets import ROVER_STEPS as STEPS
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from rover import EPISODES, PAPER_EPISODES, SEEDS  # noqa: E402
-from rover_soil_report import GROUNDS, SLIPS, UNTRAINED, draw, tables  # noqa: E402
+from rover_soil_report import GROUNDS, SLIPS, SOIL, UNTRAINED, draw, tables  # noqa: E402
 from writing import RESULTS, provenance, write_results  # noqa: E402
 
-SOURCES = ("sine-slip", "ar1-slip", "mixed", "dry-sand", "mixed-slope")
+SOURCES = ("sine-slip", SOIL, "ar1-slip")
 """What agents are trained on, in an order that soon gives a useful table."""
 TINY = {"hidden_size": 4, "batch_size": 4, "learning_starts": 10}
 TINY |= {"eval_every": 60, "eval_episodes": 1}
@@ -49,7 +49,7 @@ def world(name: str) -> tuple[str, str]:
 
 def tests_of(source: str) -> tuple[str, ...]:
     """What policies trained on ``source`` are tested on."""
-    return (source, *SLIPS) if source in GROUNDS else GROUNDS
+    return (*GROUNDS, *SLIPS) if source in GROUNDS else GROUNDS
 
 
 def wanted(sources: list[str], steps: int, tiny: dict[str, object]) -> list[rtd.Cell]:
@@ -162,7 +162,7 @@ def main(arguments: list[str] | None = None) -> int:
     grounds = GROUNDS
     if options.quick:
         steps, episodes, seeds, tiny = QUICK_STEPS, QUICK_EPISODES, 1, TINY
-        grounds, options.sources = ("mixed",), ["sine-slip", "mixed"]
+        grounds, options.sources = (SOIL,), ["sine-slip", SOIL]
     rows = kept(options.out / "rover_soil.parquet")
     cells = wanted(options.sources, steps, tiny)
     if not options.report:

@@ -88,8 +88,9 @@ def test_the_report_of_the_rover_on_soil(tmp_path):
     rows = pd.DataFrame(rows)
     text = report.tables(rows, ("mixed",), 3)
     assert "| td3 | -1.000 [-1.000, -1.000] | -2.000 [-2.000, -2.000] | -0.200" in text
+    assert "| *feed-forward and PI* |  |  |  | -0.200" in text
     assert "| mixed | undecided | over td3: +1.000 [+1.000, +1.000]; over lstm-td3: too few" in text
-    assert "| mixed | td3: here over sine-slip: +1.800 [+1.800, +1.800] | supported |" in text
+    assert "| mixed | td3: mixed over sine-slip: +1.800 [+1.800, +1.800] | supported |" in text
     assert "td3: sine-slip over feed-forward and PI: -1.800" in text
     report.draw(rows, ("mixed",), tmp_path)
     assert (tmp_path / "rover_soil.png").read_bytes().startswith(b"\x89PNG")
