@@ -29,6 +29,7 @@ import rtd3jax as rtd
 from rtd3jax.envs.registry import parse_disturbance
 from rtd3jax.errors import UserError
 from rtd3jax.study import presets
+from rtd3jax.study.derive import derive
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.transfer import transfer
 
@@ -103,9 +104,11 @@ def tested(run: pathlib.Path, trained_on: str, episodes: int) -> pd.DataFrame:
 
 
 def all_tested(run: pathlib.Path, episodes: int) -> pd.DataFrame:
-    """`tested` for each disturbance of a study."""
-    names = dict.fromkeys(cell.disturbance for cell in RunDirectory.open(run).cells)
-    return pd.concat([tested(run, name, episodes) for name in names], ignore_index=True)
+    """`tested` for each disturbance of a study; empty for a study of another environment."""
+    own = [cell for cell in RunDirectory.open(run).cells if cell.env == "pendulum"]
+    names = dict.fromkeys(cell.disturbance for cell in own)
+    rows = [tested(run, name, episodes) for name in names]
+    return pd.concat(rows, ignore_index=True) if rows else pd.DataFrame()
 
 
 def own_setting(config: rtd.Config) -> str:
@@ -187,9 +190,13 @@ def facts(lanes: pd.DataFrame, began: float) -> dict[str, object]:
 
 def curves_of(run: pathlib.Path) -> pd.DataFrame:
     """Normalised learning curves of a run directory: a row per lane and evaluation."""
-    kept = pd.read_parquet(run / "curves.parquet")
+    directory = RunDirectory.open(run)
+    path = run / "curves.parquet"
+    if not path.exists():  # the study was killed before it wrote its first tables
+        derive(directory, (), pictures=False)
+    kept = pd.read_parquet(path)
     kept = kept.assign(normalised=normalised(kept, "disturbance").round(4))
-    configs = {tuple(c.key.values()): c.config for c in RunDirectory.open(run).cells}
+    configs = {tuple(c.key.values()): c.config for c in directory.cells}
     own = kept[["env", "disturbance", "algorithm", "history_length"]].itertuples(index=False)
     settings = [own_setting(configs[tuple(key)]) for key in own]
     names = ["algorithm", "history_length", "disturbance", "seed", "step", "normalised"]
