@@ -192,8 +192,10 @@ def curves_of(run: pathlib.Path) -> pd.DataFrame:
     """Normalised learning curves of a run directory: a row per lane and evaluation."""
     directory = RunDirectory.open(run)
     path = run / "curves.parquet"
-    if not path.exists():  # the study was killed before it wrote its first tables
-        derive(directory, (), pictures=False)
+    lanes = ["env", "disturbance", "algorithm", "history_length", "seed"]
+    done = sum(directory.lanes.is_done(c, s) for c in directory.cells for s in directory.seeds)
+    if not path.exists() or len(pd.read_parquet(path, columns=lanes).drop_duplicates()) < done:
+        derive(directory, (), pictures=False)  # lanes have ended since the study wrote its tables
     kept = pd.read_parquet(path)
     kept = kept.assign(normalised=normalised(kept, "disturbance").round(4))
     configs = {tuple(c.key.values()): c.config for c in directory.cells}
