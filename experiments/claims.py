@@ -46,6 +46,11 @@ SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "undecided"
 NO_EFFECT = "no effect"
 
 
+def resampled_means(values: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """The means of ``RESAMPLES`` bootstrap samples of ``values``."""
+    return values[random.integers(0, len(values), (RESAMPLES, len(values)))].mean(axis=1)
+
+
 @dataclasses.dataclass(frozen=True)
 class Effect:
     """A difference that should be positive by a claim: its name, and both sides' values by seed."""
@@ -58,10 +63,7 @@ class Effect:
     def interval(self) -> tuple[float, float, float]:
         """The difference of means and its bootstrap interval."""
         random = np.random.default_rng(0)
-        means = [
-            side[random.integers(0, len(side), (RESAMPLES, len(side)))].mean(axis=1)
-            for side in (self.better, self.worse)
-        ]
+        means = [resampled_means(side, random) for side in (self.better, self.worse)]
         low, high = np.quantile(means[0] - means[1], (0.025, 0.975))
         return float(self.better.mean() - self.worse.mean()), float(low), float(high)
 

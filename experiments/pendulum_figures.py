@@ -99,17 +99,12 @@ def learning_curves(curves: pd.DataFrame) -> Figure:
             axes.axhline(1.0, color=GREY, lw=0.8)
             axes.set_ylim(-0.1, 1.05)
             axes.grid(color="#E4E4E4", lw=0.6)
-            lone = own.groupby("history_length")["seed"].nunique().eq(1).any()
-            note = "not run" if own.empty else "one seed's curve was kept" if lone else ""
-            axes.text(
-                0.5,
-                0.5 if own.empty else 0.04,
-                note,
-                ha="center",
-                va="center" if own.empty else "bottom",
-                fontsize="medium" if own.empty else "x-small",
-                transform=axes.transAxes,
-            )
+            middle = {"ha": "center", "transform": axes.transAxes}
+            if own.empty:
+                axes.text(0.5, 0.5, "not run", va="center", **middle)
+            elif own.groupby("history_length")["seed"].nunique().eq(1).any():
+                note = "one seed's curve was kept"
+                axes.text(0.5, 0.04, note, va="bottom", fontsize="x-small", **middle)
             if number == 0:
                 axes.set_title(agent, fontsize=9)
         row[0].set_ylabel(name, fontsize=9)

@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 import rtd3jax as rtd
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-from claims import BEST, RESAMPLES, ROVER_MARGIN, Effect, combine  # noqa: E402
+from claims import BEST, combine, on_the_rover, resampled_means  # noqa: E402
+from rover import pick  # noqa: E402
 from writing import markdown_table  # noqa: E402
 
 SLIPS = ("ar1-slip", "sine-slip")
@@ -30,14 +31,9 @@ COLOURS = {"ar1-slip": "#56B4E9", "sine-slip": "#E69F00", SOIL: "#009E73"}
 CONTROLLER_LINES = {"feed-forward and PI": "-", "adaptive slip estimate": "--"}
 
 
-def pick(rows: pd.DataFrame, algorithm: str, trained_on: str, tested_on: str) -> np.ndarray:
+def means_of(rows: pd.DataFrame, algorithm: str, trained_on: str, tested_on: str) -> np.ndarray:
     """Mean return of each seed."""
-    here = rows[
-        (rows["algorithm"] == algorithm)
-        & (rows["trained_on"] == trained_on)
-        & (rows["tested_on"] == tested_on)
-    ]
-    return here["mean"].to_numpy()
+    return pick(rows, algorithm, trained_on, tested_on)["mean"].to_numpy()
 
 
 def text_of(values: np.ndarray, seeds: int) -> str:
@@ -47,8 +43,7 @@ def text_of(values: np.ndarray, seeds: int) -> str:
     count = "" if len(values) == seeds else f" ({len(values)} of {seeds} seeds)"
     if len(values) == 1:
         return f"{values[0]:.3f}{count}"
-    random = np.random.default_rng(0)
-    means = values[random.integers(0, len(values), (RESAMPLES, len(values)))].mean(axis=1)
+    means = resampled_means(values, np.random.default_rng(0))
     low, high = np.quantile(means, (0.025, 0.975))
     return f"{values.mean():.3f} [{low:.3f}, {high:.3f}]{count}"
 
@@ -62,7 +57,7 @@ def returns_on(rows: pd.DataFrame, ground: str, seeds: int) -> str:
     """The return of every agent and controller on a ground."""
 
     def entry(name: str, source: str) -> str:
-        return text_of(pick(rows, name, source, ground), seeds)
+        return text_of(means_of(rows, name, source, ground), seeds)
 
     header = ["agent", *(f"trained on {source}" for source in COLOURS), "no training"]
     body = [[a, *(entry(a, source) for source in COLOURS), ""] for a in rtd.ALGORITHMS]
@@ -74,22 +69,19 @@ def returns_on(rows: pd.DataFrame, ground: str, seeds: int) -> str:
 def way_back(rows: pd.DataFrame, seeds: int) -> str:
     """The return of the agents of soil under the rover's slips."""
     header = ["agent", *(f"{SOIL} → {slip}" for slip in SLIPS)]
-    body = [[a, *(text_of(pick(rows, a, SOIL, s), seeds) for s in SLIPS)] for a in rtd.ALGORITHMS]
+    body = [
+        [a, *(text_of(means_of(rows, a, SOIL, s), seeds) for s in SLIPS)] for a in rtd.ALGORITHMS
+    ]
     return f"The way back, to the rover's slips:\n\n{markdown_table(header, body)}"
-
-
-def difference(name: str, better: np.ndarray, worse: np.ndarray) -> Effect:
-    """A difference of returns, with the margin of the rover."""
-    return Effect(name, better, worse, ROVER_MARGIN)
 
 
 def claim_14(rows: pd.DataFrame, grounds: tuple[str, ...]) -> str:
     """The paper's claim 14 on each ground: of the agents of sine slip, `BEST` transfers best."""
     body = []
     for ground in grounds:
-        best = pick(rows, BEST, TRANSFER_SLIP, ground)
+        best = means_of(rows, BEST, TRANSFER_SLIP, ground)
         effects = [
-            difference(f"over {name}", best, pick(rows, name, TRANSFER_SLIP, ground))
+            on_the_rover(f"over {name}", best, means_of(rows, name, TRANSFER_SLIP, ground))
             for name in rtd.ALGORITHMS
             if name != BEST
         ]
@@ -103,13 +95,13 @@ def against(rows: pd.DataFrame, grounds: tuple[str, ...]) -> str:
     """What training on soil gains over each slip, and each training over the best controller."""
     body = []
     for ground in grounds:
-        plain = {name: pick(rows, name, UNTRAINED, ground) for name in untrained(rows)}
+        plain = {name: means_of(rows, name, UNTRAINED, ground) for name in untrained(rows)}
         best = max(plain, key=lambda name: plain[name].mean())
         for name in rtd.ALGORITHMS:
-            of = {source: pick(rows, name, source, ground) for source in COLOURS}
+            of = {source: means_of(rows, name, source, ground) for source in COLOURS}
             effects = [
-                *(difference(f"{name}: {SOIL} over {s}", of[SOIL], of[s]) for s in SLIPS),
-                *(difference(f"{name}: {s} over {best}", of[s], plain[best]) for s in COLOURS),
+                *(on_the_rover(f"{name}: {SOIL} over {s}", of[SOIL], of[s]) for s in SLIPS),
+                *(on_the_rover(f"{name}: {s} over {best}", of[s], plain[best]) for s in COLOURS),
             ]
             there = [e for e in effects if len(e.better) and len(e.worse)]
             body += [[ground, effect.text(), effect.verdict()] for effect in there]
@@ -131,12 +123,12 @@ def draw(rows: pd.DataFrame, grounds: tuple[str, ...], out: pathlib.Path) -> Non
     for axes, ground in zip(panels, grounds, strict=True):
         for k, (source, colour) in enumerate(COLOURS.items()):
             for i, name in enumerate(rtd.ALGORITHMS):
-                costs = -pick(rows, name, source, ground)
+                costs = -means_of(rows, name, source, ground)
                 at = np.full(len(costs), i + 0.24 * (k - 1))
                 axes.plot(at, costs, "o", color=colour, markersize=3.5, alpha=0.8)
             axes.plot([], [], "o", color=colour, label=f"trained on {source}")
         for name, style in CONTROLLER_LINES.items():
-            cost = -pick(rows, name, UNTRAINED, ground).mean()
+            cost = -means_of(rows, name, UNTRAINED, ground).mean()
             axes.axhline(cost, color="#777777", linestyle=style, linewidth=1, label=name)
         axes.set_yscale("log")
         axes.set_title(f"on {ground}")
