@@ -14,15 +14,15 @@ if it lies outside the margin. Otherwise the verdict is *undecided*: there are t
 interval is too wide. A claim with several comparisons has the verdict of the worst comparison.
 
 The values are returns for the rover, and normalised returns of the current settings for the
-pendulum. For iteration times, rounds of the benchmark replace seeds. The script writes claims.md
-and .parquet.
+pendulum, as means over the window lengths that all sides of a comparison have. For iteration times,
+rounds of the benchmark replace seeds. The script writes claims.md and .parquet.
 """
 
 import argparse
 import dataclasses
 import pathlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
 import numpy as np
 import pandas as pd
@@ -30,81 +30,21 @@ import pandas as pd
 import rtd3jax as rtd
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
+from effects import (  # noqa: E402
+    RESAMPLES,
+    Effect,
+    Equal,
+    combine,
+)
 from pendulum_cells import current_setting  # noqa: E402
 from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
 
-FEWEST_SEEDS = 3
-MARGIN = 0.02
 ROVER_MARGIN = 0.02 * 1.36
 PARTIAL = ("temporal-sine", "random-sine", "noise", "hidden")
 HARD_NOISE = "noise:sigma=1.0"
 BIAS = "temporal-bias:amplitude_min=1.0,amplitude_max=1.0"
-RESAMPLES = 10_000
 LSTM_AGENTS = [a for a in rtd.ALGORITHMS if a.startswith("lstm")]
 BEST = "lstm-td3-1ha1hc"
-SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "undecided"
-NO_EFFECT = "no effect"
-
-
-def resampled_means(values: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """The means of ``RESAMPLES`` bootstrap samples of ``values``."""
-    return values[random.integers(0, len(values), (RESAMPLES, len(values)))].mean(axis=1)
-
-
-@dataclasses.dataclass(frozen=True)
-class Effect:
-    """A difference that should be positive by a claim: its name, and both sides' values by seed."""
-
-    name: str
-    better: np.ndarray
-    worse: np.ndarray
-    margin: float = MARGIN
-
-    def interval(self) -> tuple[float, float, float]:
-        """The difference of means and its bootstrap interval."""
-        random = np.random.default_rng(0)
-        means = [resampled_means(side, random) for side in (self.better, self.worse)]
-        low, high = np.quantile(means[0] - means[1], (0.025, 0.975))
-        return float(self.better.mean() - self.worse.mean()), float(low), float(high)
-
-    def verdict(self) -> str:
-        """Supported, contradicted, no effect or undecided."""
-        if min(len(self.better), len(self.worse)) < FEWEST_SEEDS:
-            return UNDECIDED
-        _, low, high = self.interval()
-        if low > 0 or high < 0:
-            return SUPPORTED if low > 0 else CONTRADICTED
-        return NO_EFFECT if max(-low, high) <= self.margin else UNDECIDED
-
-    def text(self) -> str:
-        """The numbers of the effect, for the table."""
-        if min(len(self.better), len(self.worse)) < FEWEST_SEEDS:
-            return f"{self.name}: too few seeds ({len(self.better)}, {len(self.worse)})"
-        mean, low, high = self.interval()
-        none = f", no effect beyond ±{max(-low, high):.3f}" if low <= 0 <= high else ""
-        return f"{self.name}: {mean:+.3f} [{low:+.3f}, {high:+.3f}]{none}"
-
-
-def combine(verdicts: list[str]) -> str:
-    """The verdict of a claim with several comparisons: the worst one; undecided without any."""
-    for verdict in (CONTRADICTED, UNDECIDED, NO_EFFECT):
-        if verdict in verdicts:
-            return verdict
-    return SUPPORTED if verdicts else UNDECIDED
-
-
-@dataclasses.dataclass(frozen=True)
-class Equal(Effect):
-    """A difference that should be zero by a claim: within the margin."""
-
-    def verdict(self) -> str:
-        """Supported if the interval lies within the margin, contradicted if it lies outside."""
-        if min(len(self.better), len(self.worse)) < FEWEST_SEEDS:
-            return UNDECIDED
-        _, low, high = self.interval()
-        if low >= -self.margin and high <= self.margin:
-            return SUPPORTED
-        return CONTRADICTED if low > self.margin or high < -self.margin else UNDECIDED
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,21 +70,34 @@ class Results:
         key = {"algorithm": algorithm, "trained_on": trained, "tested_on": tested}
         return _by_seed(self.rover, key, "mean")
 
-    def on_pendulum(
-        self, algorithm: str, disturbance: str, length: int | None = None
-    ) -> np.ndarray:
-        """Normalised return of each seed, for one window length or as a mean over all lengths."""
-        key: dict = {"algorithm": algorithm, "disturbance": disturbance}
-        if length is not None and algorithm != "td3":
-            key["history_length"] = length
-        return _by_seed(self.pendulum, key, "normalised")
+    def on_pendulum(self, algorithm: str, disturbance: str, lengths: Collection[int]) -> np.ndarray:
+        """Normalised return of each seed: for agents with a window, a mean over ``lengths``."""
+        key = {"algorithm": algorithm, "disturbance": disturbance}
+        if self.pendulum.empty:
+            return np.empty(0)
+        known = self.pendulum["history_length"].isin([0, *lengths])
+        return _by_seed(self.pendulum[known], key, "normalised")
 
-    def lengths(self) -> list[int]:
-        """Window lengths in the results of the pendulum."""
+    def lengths(self, algorithm: str, disturbance: str) -> list[int]:
+        """Window lengths with which the agent was trained under the disturbance."""
         if self.pendulum.empty:
             return []
-        found = self.pendulum["history_length"]
-        return sorted(int(length) for length in found[found > 0].unique())
+        own = _rows(self.pendulum, {"algorithm": algorithm, "disturbance": disturbance})
+        return sorted(int(length) for length in own["history_length"].unique())
+
+    def compared(self, *sides: tuple[str, str]) -> tuple[str, list[np.ndarray]]:
+        """The normalised returns of each agent and disturbance, with the same window lengths.
+
+        While the trainings are incomplete, one side may have window lengths that another lacks.
+        Only the lengths of all sides count; `td3`, which has no window, counts with each.
+
+        Returns:
+            The lengths, as text for the name of the effect, and an array of seeds for each side.
+        """
+        windows = [set(self.lengths(*side)) for side in sides if side[0] != "td3"]
+        shared = sorted(set.intersection(*windows)) if windows else []
+        listed = f" (l = {', '.join(map(str, shared))})" if shared else ""
+        return listed, [self.on_pendulum(*side, shared) for side in sides]
 
     def carried(self, algorithm: str, tested: str) -> np.ndarray:
         """Normalised returns, by seed, of an agent of `random-sine` under another condition."""
@@ -194,18 +147,17 @@ def equal(effects: list[Effect]) -> list[Effect]:
 
 def history_helps(results: Results, disturbance: str) -> list[Effect]:
     """Action history helps."""
-    with_it, without = (
-        results.on_pendulum(agent, disturbance) for agent in ("lstm-td3", "lstm-td3-no-action")
-    )
-    return [Effect("lstm-td3 over lstm-td3-no-action", with_it, without)]
+    agents = ("lstm-td3", "lstm-td3-no-action")
+    lengths, sides = results.compared(*((agent, disturbance) for agent in agents))
+    return [Effect(f"lstm-td3 over lstm-td3-no-action{lengths}", *sides)]
 
 
 def length_helps(results: Results, disturbance: str) -> list[Effect]:
     """The longest window over the shortest."""
-    lengths = results.lengths()
+    lengths = results.lengths("lstm-td3", disturbance)
     if len(lengths) < 2:  # without a comparison, the claim is undecided
         return [Effect("lstm-td3, longest over shortest window", np.empty(0), np.empty(0))]
-    long, short = (results.on_pendulum("lstm-td3", disturbance, lengths[k]) for k in (-1, 0))
+    long, short = (results.on_pendulum("lstm-td3", disturbance, [lengths[k]]) for k in (-1, 0))
     return [Effect(f"lstm-td3, l={lengths[-1]} over l={lengths[0]}", long, short)]
 
 
@@ -217,9 +169,8 @@ def temporal_sine(results: Results) -> list[Effect]:
 def noise(results: Results) -> list[Effect]:
     """Claim 5, without the fall of returns late in training, which the curves show."""
     found = history_helps(results, "noise") + length_helps(results, "noise")
-    sigmas = ("noise", HARD_NOISE)
-    small, large = (results.on_pendulum("lstm-td3", name) for name in sigmas)
-    return [*found, Effect("lstm-td3, sigma 0.5 over 1.0", small, large)]
+    lengths, sides = results.compared(("lstm-td3", "noise"), ("lstm-td3", HARD_NOISE))
+    return [*found, Effect(f"lstm-td3, sigma 0.5 over 1.0{lengths}", *sides)]
 
 
 def hidden(results: Results) -> list[Effect]:
@@ -229,38 +180,37 @@ def hidden(results: Results) -> list[Effect]:
 
 def memory_helps(results: Results) -> list[Effect]:
     """Claim 7."""
-    return [
-        Effect(
-            f"{disturbance}: {agent} over td3",
-            results.on_pendulum(agent, disturbance),
-            results.on_pendulum("td3", disturbance),
-        )
-        for disturbance in PARTIAL
-        for agent in LSTM_AGENTS
-    ]
+    found = []
+    for disturbance in PARTIAL:
+        for agent in LSTM_AGENTS:
+            lengths, sides = results.compared((agent, disturbance), ("td3", disturbance))
+            found.append(Effect(f"{disturbance}: {agent} over td3{lengths}", *sides))
+    return found
 
 
 def one_stream(results: Results) -> list[Effect]:
     """Claim 8: on average over the disturbances."""
-
-    def overall(agent: str) -> np.ndarray:
-        found = [results.on_pendulum(agent, disturbance) for disturbance in PARTIAL]
-        return np.mean(found, axis=0) if len({len(v) for v in found}) == 1 else np.empty(0)
-
-    others = [agent for agent in rtd.ALGORITHMS if agent != BEST]
-    return [Effect(f"{BEST} over {agent}", overall(BEST), overall(agent)) for agent in others]
+    found = []
+    for agent in rtd.ALGORITHMS:
+        if agent == BEST:
+            continue
+        pairs = [(name, disturbance) for name in (BEST, agent) for disturbance in PARTIAL]
+        lengths, sides = results.compared(*pairs)
+        same = len({len(side) for side in sides}) == 1
+        halves = sides[: len(PARTIAL)], sides[len(PARTIAL) :]
+        means = [np.mean(half, axis=0) if same else np.empty(0) for half in halves]
+        found.append(Effect(f"{BEST} over {agent}{lengths}", *means))
+    return found
 
 
 def stored_carries(results: Results) -> list[Effect]:
     """Claim 9."""
-    return [
-        (Effect if disturbance == "noise" else Equal)(
-            f"{disturbance}: lstm-td3 over h-td3",
-            results.on_pendulum("lstm-td3", disturbance),
-            results.on_pendulum("h-td3", disturbance),
-        )
-        for disturbance in PARTIAL
-    ]
+    found = []
+    for disturbance in PARTIAL:
+        lengths, sides = results.compared(("lstm-td3", disturbance), ("h-td3", disturbance))
+        kind = Effect if disturbance == "noise" else Equal
+        found.append(kind(f"{disturbance}: lstm-td3 over h-td3{lengths}", *sides))
+    return found
 
 
 def iteration_time(results: Results) -> list[Effect]:

@@ -31,7 +31,7 @@ from rtd3jax.study.presets import ROVER_SETTINGS as SETTINGS
 from rtd3jax.study.presets import ROVER_STEPS as STEPS
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-from claims import Effect  # noqa: E402
+from effects import Effect  # noqa: E402
 from settings import mark, notes, setting_text  # noqa: E402
 from writing import (  # noqa: E402
     RESULTS,

@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 import rtd3jax as rtd
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-from claims import BEST, combine, on_the_rover, resampled_means  # noqa: E402
+from claims import BEST, on_the_rover  # noqa: E402
+from effects import combine, resampled_means  # noqa: E402
 from rover import pick  # noqa: E402
 from writing import markdown_table  # noqa: E402
 

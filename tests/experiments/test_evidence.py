@@ -217,6 +217,36 @@ def test_the_pendulums_claims_follow_from_its_tables(tmp_path):
         assert found[5] == verdict
 
 
+def test_comparisons_share_their_window_lengths(tmp_path):
+    """An agent that is trained with more windows than another is compared at the common ones."""
+    claims = load(EXPERIMENTS / "claims.py")
+    returns = {("lstm-td3", 6): 0.8, ("lstm-td3", 1): 0.1, ("lstm-td3-no-action", 6): 0.7}
+    returns |= {("td3", 0): 0.2, ("lstm-td3", 20): 0.9}
+    lanes = [
+        {
+            "algorithm": agent,
+            "disturbance": "temporal-sine",
+            "history_length": length,
+            "seed": seed,
+            "normalised": value,
+        }
+        for (agent, length), value in returns.items()
+        for seed in range(5)
+    ]
+    pd.DataFrame(lanes).to_parquet(tmp_path / "pendulum.parquet")
+    results = claims.Results.read(tmp_path)
+    effects = claims.temporal_sine(results) + claims.memory_helps(results)[:2]
+    found = {effect.name: effect.interval()[0] for effect in effects if len(effect.better)}
+    assert found == pytest.approx(
+        {
+            "lstm-td3 over lstm-td3-no-action (l = 6)": 0.1,
+            "lstm-td3, l=20 over l=1": 0.8,
+            "temporal-sine: lstm-td3 over td3 (l = 1, 6, 20)": 0.6 - 0.2,
+            "temporal-sine: lstm-td3-no-action over td3 (l = 6)": 0.5,
+        }
+    )
+
+
 def test_the_pendulum_experiment_runs(tmp_path, capsys, monkeypatch):
     pendulum = load(EXPERIMENTS / "pendulum.py")
     best = pendulum.rtd.Ceiling(-136.0, 0.5, "exact")
