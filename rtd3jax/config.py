@@ -212,8 +212,6 @@ class Config:
         for field in dataclasses.fields(self):
             if "low" in field.metadata:
                 object.__setattr__(self, field.name, self._checked(field))
-        capacity = self.total_steps if self.replay_capacity is None else self.replay_capacity
-        object.__setattr__(self, "replay_capacity", capacity)
         if self.batch_size > self.learning_starts:
             raise UserError(
                 f"batch_size ({self.batch_size}) is larger than learning_starts "
@@ -222,7 +220,7 @@ class Config:
             )
         if self.replay == "segments":
             self._check_segments()
-        self._check_environments(capacity)
+        self._check_environments()
         for name in ("start", "freeze"):
             if not isinstance(getattr(self, name), str):
                 raise UserError(f"{name} must be a string, not {getattr(self, name)!r}")
@@ -233,9 +231,9 @@ class Config:
                     "actor.memory"
                 )
         window = 1 + self.window_tokens
-        if capacity < max(self.batch_size, window):
+        if self.capacity < max(self.batch_size, window):
             raise UserError(
-                f"replay_capacity ({capacity}) holds less than a batch "
+                f"replay_capacity ({self.capacity}) holds less than a batch "
                 f"({self.batch_size}) or a window ({window}); raise replay_capacity"
             )
 
@@ -284,8 +282,8 @@ class Config:
         for name, value in resolved.items():
             object.__setattr__(self, name, value)
 
-    def _check_environments(self, capacity: int) -> None:
-        count = self.environments
+    def _check_environments(self) -> None:
+        count, capacity = self.environments, self.capacity
         if count == 1:
             return
         for name, value in (
@@ -411,18 +409,19 @@ class Config:
     @property
     def capacity(self) -> int:
         """Transitions that the replay keeps."""
-        assert self.replay_capacity is not None  # resolved when it was made
-        return self.replay_capacity
+        return self.total_steps if self.replay_capacity is None else self.replay_capacity
 
     def to_dict(self) -> dict[str, Any]:
-        """The fields as JSON-ready values, with the step at which the actor does start."""
-        return {**dataclasses.asdict(self), "actor_starts": self.first_actor_step}
+        """The fields as JSON-ready values, with the defaults that depend on other fields."""
+        fields = dataclasses.asdict(self)
+        return {**fields, "actor_starts": self.first_actor_step, "replay_capacity": self.capacity}
 
     @classmethod
     def from_dict(cls, fields: Mapping[str, Any]) -> "Config":
         """The configuration that `to_dict` wrote, in this version or an earlier one.
 
-        An actor that starts when learning does is taken for one that was not told when.
+        A field whose value is the default that depends on another field follows that field again:
+        an actor that starts when learning does, and a replay as large as the training is long.
 
         Raises:
             UserError: when a value is impossible.
@@ -431,6 +430,8 @@ class Config:
         given = dict(fields)
         if given.get("actor_starts") == given.get("learning_starts", cls.learning_starts):
             del given["actor_starts"]
+        if given.get("replay_capacity") == given.get("total_steps", cls.total_steps):
+            given.pop("replay_capacity", None)
         return cls(**given)
 
 

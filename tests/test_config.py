@@ -42,7 +42,18 @@ def test_a_history_length_on_td3_warns():
 
 def test_a_resolved_configuration_is_a_fixed_point():
     config = rtd.Config(algorithm="h-td3")
-    assert dataclasses.replace(config) == config and config.replay_capacity == config.total_steps
+    assert dataclasses.replace(config) == config
+
+
+def test_the_replay_is_as_large_as_the_training_unless_it_is_told_its_size():
+    config = rtd.Config(total_steps=2_000)
+    longer = dataclasses.replace(config, total_steps=50_000)
+    assert (config.capacity, longer.capacity) == (2_000, 50_000)
+    told = dataclasses.replace(rtd.Config(replay_capacity=3_000), total_steps=50_000)
+    assert told.capacity == 3_000
+    read = rtd.Config.from_dict(config.to_dict())
+    assert config.to_dict()["replay_capacity"] == 2_000
+    assert dataclasses.replace(read, total_steps=50_000).capacity == 50_000
 
 
 def test_the_actor_starts_with_learning_unless_it_is_told_when():
@@ -54,7 +65,9 @@ def test_the_actor_starts_with_learning_unless_it_is_told_when():
     assert told.first_actor_step == 1_000 and told.updates_before_the_actor == 500
 
 
-@pytest.mark.parametrize("given", [{}, {"actor_starts": 3_000}, {"learning_starts": 2_000}])
+@pytest.mark.parametrize(
+    "given", [{}, {"actor_starts": 3_000}, {"learning_starts": 2_000}, {"replay_capacity": 9_000}]
+)
 def test_a_configuration_is_read_as_it_was_written(given):
     config = rtd.Config(**given)
     fields = config.to_dict()
