@@ -143,6 +143,25 @@ def test_the_papers_counts_are_met(tmp_path):
     assert (table["critic"] == table["paper_critic"]).all()
 
 
+def test_longer_windows_of_the_rover_are_trained_once(tmp_path, capsys):
+    experiment = load(EXPERIMENTS / "rover_lengths.py")
+    shutil.copy(EXPERIMENTS / "results" / "rover.parquet", tmp_path)
+    quick = ["--quick", "--out", str(tmp_path)]
+    assert experiment.main([*quick, "--run", str(tmp_path / "run")]) == 0
+    rows = pd.read_parquet(tmp_path / "rover_lengths.parquet")
+    assert list(rows["history_length"]) == [3] and list(rows["steps"]) == [60]
+    said = capsys.readouterr().out
+    assert "has 0 of 1 cells" in said and f"{rows['mean'][0]:.3f} (1 of 5 seeds)" in said
+    # Window 1 and td3 come from the rover's own table.
+    assert "| ar1-slip | lstm-td3-1ha1hc | -1.245" in said
+    assert "-2.916 ± 0.025 | no window |" in said
+    assert (tmp_path / "rover_lengths.png").stat().st_size > 5_000
+
+    assert experiment.main([*quick, "--run", str(tmp_path / "elsewhere")]) == 0
+    assert "has 1 of 1 cells" in capsys.readouterr().out
+    assert not (tmp_path / "elsewhere").exists()
+
+
 def test_verdicts_follow_from_the_numbers():
     claims = load(EXPERIMENTS / "claims.py")
     good, bad = np.array([-1.3, -1.31, -1.29]), np.array([-2.9, -3.0, -2.8])

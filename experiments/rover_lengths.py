@@ -1,0 +1,228 @@
+"""The rover's agents with longer windows, under AR(1) and sine slip.
+
+Usage: python experiments/rover_lengths.py [--quick] [--run DIR] [--out DIR] [--steps N]
+                                           [--lengths L ...] [--slips S ...] [--algorithms A ...]
+                                           [--report]
+
+The table of experiments/rover.py has agents whose window is one past observation. This script
+trains the agents that have a window with three longer ones, with the same settings, seeds and
+steps, and tests all of them in 1,000 episodes of AR(1) slip. It writes rover_lengths.md, .parquet
+(a row per policy) and .png; window 1 and `td3` are read from rover.parquet. It trains the cells
+that the table does not have yet, as a study in DIR, in the order of the lengths, slips and agents
+of the command; if you repeat the command, it only trains what is missing. `--report` does not
+train: it tests what DIR has so far, also of a study that has not ended.
+"""
+
+import argparse
+import pathlib
+import sys
+import time
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+import rtd3jax as rtd
+from rtd3jax.study.plan import Grid, make_cells
+from rtd3jax.study.presets import ROVER_HISTORY_LENGTH, ROVER_SETTINGS, ROVER_STEPS
+
+sys.path.insert(0, str(pathlib.Path(__file__).parent))
+from rover import EPISODES, PAPER_EPISODES, SEEDS  # noqa: E402
+from rover import PAPER as PAPER_RETURNS  # noqa: E402
+from settings import setting_text  # noqa: E402
+from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
+
+SLIPS = ("ar1-slip", "sine-slip")
+TESTED_ON = "ar1-slip"
+LENGTHS = (3, 6, 10)
+WITH_WINDOW = (
+    "lstm-td3-no-action",
+    "lstm-td3-1ha1hc",
+    "lstm-td3",
+    "lstm-td3-1ha2hc",
+    "h-td3",
+)
+"""The agent whose return differs most from the paper's comes first."""
+TINY = {"hidden_size": 4, "batch_size": 4, "learning_starts": 10}
+TINY |= {"eval_every": 60, "eval_episodes": 1}
+KEY = ["algorithm", "trained_on", "history_length", "seed"]
+COLUMNS = [*KEY, "steps", "episodes", "mean", "standard_error"]
+
+
+def wanted(options: argparse.Namespace, tiny: dict[str, object]) -> list[rtd.Cell]:
+    """The cells of the lengths, slips and agents in ``options``."""
+    settings = {**ROVER_SETTINGS, "total_steps": options.steps, **tiny}
+    grids = [
+        Grid("rover", (slip,), tuple(options.algorithms), (length,), settings)
+        for length in options.lengths
+        for slip in options.slips
+    ]
+    return make_cells(tuple(grids), {})
+
+
+def has(rows: pd.DataFrame, cell: rtd.Cell, seed: int) -> bool:
+    """Whether ``rows`` has the test of a lane."""
+    config = cell.config
+    key = (config.algorithm, cell.disturbance, config.window_tokens, seed, config.total_steps)
+    return bool((rows[[*KEY, "steps"]] == list(key)).all(axis=1).any())
+
+
+def train(
+    run: pathlib.Path, cells: list[rtd.Cell], rows: pd.DataFrame, seeds: range, quiet: bool
+) -> list[str]:
+    """Train the cells that ``rows`` does not have; return a line for each lane that was lost."""
+    todo = [cell for cell in cells if not all(has(rows, cell, seed) for seed in seeds)]
+    print(f"the table has {len(cells) - len(todo)} of {len(cells)} cells", flush=True)
+    if not todo:
+        return []
+    episodes = 1 if quiet else PAPER_EPISODES
+    study = rtd.Study(todo, seeds=seeds, out=run, final_episodes=episodes)
+    return study.run(quiet=quiet, page=not quiet)
+
+
+def tested(
+    run: pathlib.Path, cells: list[rtd.Cell], rows: pd.DataFrame, seeds: range, episodes: int
+) -> tuple[list[dict[str, object]], list[str]]:
+    """A row for each trained policy that ``rows`` does not have, and what is missing."""
+    env, found, missing = rtd.make("rover", TESTED_ON), [], set()
+    for cell in cells:
+        config = cell.config
+        for seed in (seed for seed in seeds if not has(rows, cell, seed)):
+            key = (config.algorithm, cell.disturbance, config.window_tokens, seed)
+            try:
+                policy = rtd.load_policy(
+                    run,
+                    algorithm=config.algorithm,
+                    disturbance=cell.disturbance,
+                    history_length=config.window_tokens,
+                    seed=seed,
+                )
+            except rtd.UserError as error:
+                missing.add(str(error))
+                continue
+            returns = np.asarray(rtd.evaluate(policy, env, episodes, seed=seed), np.float64)
+            error = float(returns.std(ddof=1) / np.sqrt(episodes))
+            values = (*key, config.total_steps, episodes, float(returns.mean()), error)
+            found.append(dict(zip(COLUMNS, values, strict=True)))
+    return found, sorted(missing)
+
+
+def of_the_rover(results: pathlib.Path) -> pd.DataFrame:
+    """Rows of `td3`, and of window 1, from the table of experiments/rover.py with its settings."""
+    path = results / "rover.parquet"
+    if not path.exists():
+        return pd.DataFrame(columns=COLUMNS)
+    rows = pd.read_parquet(path)
+    setting = setting_text({**ROVER_SETTINGS, "total_steps": ROVER_STEPS})
+    rows = rows[rows["trained_on"].isin(SLIPS) & (rows["tested_on"] == TESTED_ON)]
+    rows = rows[rows["setting"] == setting]
+    windows = np.where(rows["algorithm"] == "td3", 0, ROVER_HISTORY_LENGTH)
+    return rows.assign(history_length=windows, steps=ROVER_STEPS)[COLUMNS]
+
+
+def returns_of(rows: pd.DataFrame, slip: str, algorithm: str, length: int) -> np.ndarray:
+    """Mean returns of the seeds of one cell."""
+    own = rows[(rows["algorithm"] == algorithm) & (rows["trained_on"] == slip)]
+    return own[own["history_length"] == length]["mean"].to_numpy(np.float64)
+
+
+def table(rows: pd.DataFrame) -> str:
+    """For each slip, mean ± standard deviation over seeds: agents by window length."""
+    lengths = (ROVER_HISTORY_LENGTH, *LENGTHS)
+    header = ["trained on", "agent", *(f"l = {length}" for length in lengths), "the paper"]
+    body = []
+    for column, slip in enumerate(SLIPS):
+        for algorithm in rtd.ALGORITHMS:
+            line = [slip, algorithm]
+            for length in lengths:
+                if algorithm == "td3" and length != lengths[0]:
+                    line.append("no window")
+                    continue
+                found = returns_of(rows, slip, algorithm, 0 if algorithm == "td3" else length)
+                few = "" if len(found) in (0, SEEDS) else f" ({len(found)} of {SEEDS} seeds)"
+                spread = f" ± {found.std(ddof=1):.3f}" if len(found) > 1 else ""
+                line.append(f"{found.mean():.3f}{spread}{few}" if len(found) else "not run")
+            body.append([*line, PAPER_RETURNS[algorithm][column]])
+    return markdown_table(header, body)
+
+
+def draw(rows: pd.DataFrame, ceiling: float, out: pathlib.Path) -> None:
+    """Draw returns by window length: a panel for each slip, a line for each agent."""
+    figure = Figure(figsize=(8.4, 3.8), layout="constrained")
+    for axes, slip in zip(figure.subplots(1, len(SLIPS), sharey=True), SLIPS, strict=True):
+        for k, algorithm in enumerate(WITH_WINDOW):
+            own = {
+                n: returns_of(rows, slip, algorithm, n) for n in (ROVER_HISTORY_LENGTH, *LENGTHS)
+            }
+            own = {length: values for length, values in own.items() if len(values)}
+            means = [values.mean() for values in own.values()]
+            axes.plot(list(own), means, "o-", color=f"C{k}", label=algorithm, markersize=4)
+            for length, values in own.items():
+                axes.plot([length] * len(values), values, ".", color=f"C{k}", alpha=0.4)
+        td3 = returns_of(rows, slip, "td3", 0)
+        if len(td3):
+            axes.axhline(td3.mean(), color="#777777", linestyle="--", label="td3 (no window)")
+        axes.axhline(ceiling, color="black", linestyle=":", label="ceiling")
+        axes.set_title(f"trained on {slip}, tested on {TESTED_ON}")
+        axes.set_xlabel("window length l")
+        axes.set_xticks([ROVER_HISTORY_LENGTH, *LENGTHS])
+        axes.grid(alpha=0.3)
+    figure.axes[0].set_ylabel("return (higher is better)")
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=4, fontsize=8)
+    figure.savefig(out / "rover_lengths.png", dpi=150)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
+    parser.add_argument("--run", type=pathlib.Path, default=pathlib.Path("runs/rover_lengths"))
+    parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
+    parser.add_argument("--steps", type=int, default=ROVER_STEPS)
+    parser.add_argument("--lengths", type=int, nargs="+", choices=LENGTHS, default=[*LENGTHS])
+    parser.add_argument("--slips", nargs="+", choices=SLIPS, default=[*SLIPS])
+    parser.add_argument("--algorithms", nargs="+", choices=WITH_WINDOW, default=[*WITH_WINDOW])
+    parser.add_argument("--report", action="store_true", help="test without training")
+    options = parser.parse_args(arguments)
+    began, episodes, seeds = time.time(), EPISODES, range(SEEDS)
+    tiny: dict[str, object] = {}
+    if options.quick:
+        options.steps, episodes, seeds, tiny = 60, PAPER_EPISODES, range(1), TINY
+        options.lengths, options.slips = [3], ["ar1-slip"]
+        options.algorithms = ["lstm-td3-no-action"]
+    path = options.out / "rover_lengths.parquet"
+    rows = pd.read_parquet(path) if path.exists() else pd.DataFrame(columns=COLUMNS)
+    cells = wanted(options, tiny)
+    if not options.report:
+        for line in train(options.run, cells, rows, seeds, quiet=options.quick):
+            print(line, file=sys.stderr)
+    found, missing = tested(options.run, cells, rows, seeds, episodes)
+    if found:
+        new = pd.DataFrame(found)
+        rows = new if rows.empty else pd.concat([rows, new])
+        rows = rows.drop_duplicates(KEY, keep="last").reset_index(drop=True)
+    if rows.empty:
+        print(f"nothing is trained in {options.run} yet")
+        return 1
+    beside = of_the_rover(options.out)
+    both = rows if beside.empty else pd.concat([beside, rows], ignore_index=True)
+    best = rtd.ceiling(rtd.make("rover", TESTED_ON), episodes)
+    text = f"{table(both)}\n\nThe ceiling is {best.mean:.3f} ± {best.standard_error:.3f}."
+    facts = provenance(
+        **{**ROVER_SETTINGS, "total_steps": options.steps},
+        tested_on=TESTED_ON,
+        seeds=SEEDS,
+        episodes_per_seed=episodes,
+        cells=len(rows.drop_duplicates(KEY[:-1])),
+        minutes_of_the_last_call=round((time.time() - began) / 60, 1),
+    )
+    write_results(options.out, "rover_lengths", rows, text, facts)
+    draw(both, best.mean, options.out)
+    print(text)
+    for line in missing:
+        print(f"missing: {line}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
