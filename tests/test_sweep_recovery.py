@@ -102,7 +102,11 @@ sys.exit(sweep.main(sys.argv[3:]))
 
 @pytest.mark.parametrize(
     ("part", "times"),
-    [("config.json", 1), ("step-", 30), ("episodes.parquet", 1)],
+    [
+        ("step-", 30),
+        pytest.param("config.json", 1, marks=pytest.mark.slow),
+        pytest.param("episodes.parquet", 1, marks=pytest.mark.slow),
+    ],
 )
 def test_killed_while_it_writes(part, times, whole, tmp_path):
     out = tmp_path / "run"

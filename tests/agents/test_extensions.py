@@ -111,7 +111,12 @@ def registered():
 
 @pytest.mark.parametrize(
     ("agent", "memory"),
-    [("rdpg", "lstm"), ("tanh-td3", "gru"), ("h-td3", "min-gru"), ("lstm-td3", "echo")],
+    [
+        ("rdpg", "lstm"),
+        ("lstm-td3", "echo"),
+        pytest.param("tanh-td3", "gru", marks=pytest.mark.slow),
+        pytest.param("h-td3", "min-gru", marks=pytest.mark.slow),
+    ],
 )
 def test_what_was_added_trains_saves_loads_and_leaves(tmp_path, agent, memory):
     env = rtd.make("rover", "ar1-slip")

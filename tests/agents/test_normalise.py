@@ -70,9 +70,9 @@ def _trained(unit, algorithm, **fields):
     ("algorithm", "fields"),
     [
         ("td3", {}),
-        ("lstm-td3", {}),
-        ("h-td3", {}),
         ("lstm-td3-1ha1hc", dict(replay="segments", segment_length=4)),
+        pytest.param("lstm-td3", {}, marks=pytest.mark.slow),
+        pytest.param("h-td3", {}, marks=pytest.mark.slow),
     ],
 )
 def test_the_unit_of_a_sensor_does_not_matter(algorithm, fields):

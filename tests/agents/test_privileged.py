@@ -32,7 +32,7 @@ def _advanced(env, **changes):
     return job, state
 
 
-@pytest.mark.parametrize("environments", [1, 2])
+@pytest.mark.parametrize("environments", [2, pytest.param(1, marks=pytest.mark.slow)])
 def test_without_a_disturbance_the_replay_holds_the_observations_twice(environments):
     _, state = _advanced(rtd.make("pendulum", "noise", sigma=0.0), environments=environments)
     rows = jax.tree.map(lambda leaf: np.asarray(leaf)[:STEPS], state.replay.transitions)
@@ -55,7 +55,7 @@ def test_under_a_disturbance_the_replay_holds_what_the_sensors_hide():
     np.testing.assert_allclose(change, 0.05 * after[:, 2], atol=1e-4)
 
 
-@pytest.mark.parametrize("replay", ["windows", "segments"])
+@pytest.mark.parametrize("replay", ["segments", pytest.param("windows", marks=pytest.mark.slow)])
 def test_the_target_depends_on_the_truth_and_the_action_does_not(replay):
     more = {"segment_length": 2} if replay == "segments" else {}
     job, state = _advanced(

@@ -17,6 +17,10 @@ from rtd3jax.agents.replay import (
     sample,
 )
 
+# One program for each capacity, rather than one for each operation.
+put_transitions, put_carries = jax.jit(put_transitions), jax.jit(put_carries)
+gather = jax.jit(gather, static_argnums=3)
+
 
 def _history(lengths):
     """Rows of whole episodes; every number in them tells where it comes from."""

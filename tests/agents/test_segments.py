@@ -96,7 +96,17 @@ def _learned(networks, state, batch, order):
     return y[order], critic, actor
 
 
-@pytest.mark.parametrize("agent", [name for name in AGENTS if AGENTS[name].has_window])
+OFTEN = ("lstm-td3", "lstm-td3-1ha1hc", "h-td3")
+
+
+@pytest.mark.parametrize(
+    "agent",
+    [
+        pytest.param(name, marks=[] if name in OFTEN else [pytest.mark.slow])
+        for name in AGENTS
+        if AGENTS[name].has_window
+    ],
+)
 def test_with_whole_episodes_they_learn_what_windows_do(agent):
     replay, count = _ring(agent)
     networks, state = _networks(agent)

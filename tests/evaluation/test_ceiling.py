@@ -38,7 +38,14 @@ def test_without_slip_the_best_return_is_zero():
     assert best.kind == "exact" and best.mean == pytest.approx(0, abs=1e-6)
 
 
-@pytest.mark.parametrize("variant", ["ar1-slip", "ar1-slip-high-variance", "ar1-slip-slow"])
+@pytest.mark.parametrize(
+    "variant",
+    [
+        "ar1-slip",
+        pytest.param("ar1-slip-high-variance", marks=pytest.mark.slow),
+        pytest.param("ar1-slip-slow", marks=pytest.mark.slow),
+    ],
+)
 def test_no_other_model_and_no_scaled_command_does_better(variant):
     env = rtd.make("rover", disturbance=variant)
     model = env.default_params.slip

@@ -138,6 +138,7 @@ def test_the_papers_claim_is_judged():
     assert "grows least in lstm-td3-1ha1hc" in text  # whose made-up rate does not fall at all
 
 
+@pytest.mark.slow
 def test_lanes_on_a_device_quick(tmp_path):
     out = tmp_path / "lanes.md"
     assert lanes_on_device.main(["--quick", "--out", str(out)]) == 0

@@ -152,6 +152,7 @@ def run_notebook(folder, monkeypatch, **changed):
     return notebook.execute(cells), cells
 
 
+@pytest.mark.slow
 def test_the_notebook_runs(tmp_path, monkeypatch):
     """With fewer steps: `test_the_notebook_learns` has them all."""
     small = {"total_steps": 800, "eval_every": 400, "eval_episodes": 2, "episodes": 20}

@@ -21,9 +21,9 @@ def _jobs(seeds=1, **changes):
     ("algorithm", "length", "replay"),
     [
         ("lstm-td3-1ha1hc", 8, "windows"),
-        ("h-td3", 8, "windows"),
         ("lstm-td3-1ha2hc", 20, "segments"),
-        ("h-td3", 20, "segments"),
+        pytest.param("h-td3", 8, "windows", marks=pytest.mark.slow),
+        pytest.param("h-td3", 20, "segments", marks=pytest.mark.slow),
     ],
 )
 def test_the_plan_is_within_15_percent_of_what_xla_reserves(algorithm, length, replay):

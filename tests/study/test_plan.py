@@ -13,7 +13,6 @@ from rtd3jax.agents.learners import td3
 from rtd3jax.agents.learners.base import Networks
 from rtd3jax.agents.memory import lstm
 from rtd3jax.agents.replay import empty_replay, gather, gather_segments
-from rtd3jax.agents.variants import ALGORITHMS
 from rtd3jax.config import Config
 from rtd3jax.registries import AGENTS
 from rtd3jax.study.derive import _values_and_owners
@@ -75,10 +74,17 @@ def _counted(algorithm, length, width, batch_size, segments=None):
 @pytest.mark.parametrize(
     "algorithm, segments",
     [
-        *((name, None) for name in ALGORITHMS),
-        ("lstm-td3", (5, True)),
+        *((name, None) for name in ("td3", "lstm-td3", "lstm-td3-1ha1hc", "h-td3")),
         ("lstm-td3-1ha1hc", (5, False)),
-        ("h-td3", (5, True)),
+        *(
+            pytest.param(name, segments, marks=pytest.mark.slow)
+            for name, segments in (
+                ("lstm-td3-no-action", None),
+                ("lstm-td3-1ha2hc", None),
+                ("lstm-td3", (5, True)),
+                ("h-td3", (5, True)),
+            )
+        ),
     ],
 )
 def test_operations_are_those_that_xla_counts(algorithm, segments, monkeypatch):

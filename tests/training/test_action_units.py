@@ -26,7 +26,9 @@ def _trained(centre, half_range, algorithm):
     return params, rtd.train(ENV, config, seeds=[0], params=params, progress=False)
 
 
-@pytest.mark.parametrize("algorithm", ["td3", "lstm-td3", "h-td3"])
+@pytest.mark.parametrize(
+    "algorithm", ["lstm-td3", *(pytest.param(n, marks=pytest.mark.slow) for n in ("td3", "h-td3"))]
+)
 def test_the_unit_of_the_actions_does_not_matter(algorithm):
     _, run = _trained([0, 0], [1, 1], algorithm)
     # Powers of two are exact: the same to the bit, also where elements differ by 2**20.

@@ -39,7 +39,16 @@ def _same(a, b):
     )
 
 
-@pytest.mark.parametrize("algorithm", rtd.ALGORITHMS)
+@pytest.mark.parametrize(
+    "algorithm",
+    [
+        *("td3", "lstm-td3", "lstm-td3-1ha1hc", "h-td3"),
+        *(
+            pytest.param(f"lstm-td3-{name}", marks=pytest.mark.slow)
+            for name in ("no-action", "1ha2hc")
+        ),
+    ],
+)
 def test_every_agent_trains_and_its_policy_plays(algorithm):
     env = _rover()
     run = _train(algorithm, env=env)

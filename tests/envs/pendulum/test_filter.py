@@ -59,7 +59,13 @@ def test_the_belief_is_the_posterior_of_a_million_starts(seed, steps):
     np.testing.assert_allclose(spread, np.sqrt(np.diag(covariance)), rtol=0.25, atol=0.02)
 
 
-@pytest.mark.parametrize("disturbance", ["hidden", "random-sine", "temporal-sine"])
+@pytest.mark.parametrize(
+    "disturbance",
+    [
+        "temporal-sine",
+        *(pytest.param(n, marks=pytest.mark.slow) for n in ("hidden", "random-sine")),
+    ],
+)
 def test_what_determines_the_state_costs_nothing(disturbance):
     env, plain = rtd.make("pendulum", disturbance), rtd.make("pendulum")
     returns = rtd.evaluate(rtd.filter_policy(env), env, 40)

@@ -71,6 +71,7 @@ def test_interpolation_is_exact_at_grid_points_and_periodic():
     np.testing.assert_allclose(between, corners.mean(), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_looking_one_step_ahead_with_these_values_reaches_them_in_the_real_world():
     """gymnax's own step, not ours: the dynamics that were solved are those that are played."""
     env, params = rtd.make("pendulum").base, _params()
