@@ -34,12 +34,14 @@ from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.transfer import transfer
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
+from continuing import train_missing  # noqa: E402
 from pendulum_cells import cells, current_setting, missing, settings_of  # noqa: E402
 from pendulum_figures import draw_all, filter_returns  # noqa: E402
 from settings import mark, notes, setting_text  # noqa: E402
 from writing import (  # noqa: E402
     RESULTS,
     markdown_table,
+    mean_text,
     provenance,
     write_results,
 )
@@ -159,9 +161,8 @@ def table(
             for name in names:
                 here = own[(own["history_length"] == length) & (own[column] == name)]
                 values = here["normalised"]
-                spread = f" ± {values.std(ddof=1):.3f}" if len(values) > 1 else ""
                 dagger = mark(int(older[here.index].sum()), len(here))
-                line.append(f"{values.mean():.3f}{spread}{dagger}" if len(values) else "not run")
+                line.append(f"{mean_text(values, 3)}{dagger}" if len(values) else "not run")
             body.append(line)
     if filtered:
         known = [f"{filtered[name]:.3f}" if name in filtered else "–" for name in names]
@@ -246,13 +247,7 @@ def train(options: argparse.Namespace, tiny: dict[str, object]) -> list[str]:
         table = pd.DataFrame()  # an earlier version wrote the table
     wanted = cells(options, tiny)
     todo = missing(wanted, table, options.seeds)
-    print(f"{path} has {len(wanted) - len(todo)} of {len(wanted)} cells", flush=True)
-    if not todo:
-        return []
-    study = rtd.Study(
-        todo, seeds=range(options.seeds), out=options.run, final_episodes=1 if tiny else 20
-    )
-    return study.run(quiet=bool(tiny), page=not tiny)
+    return train_missing(path, wanted, todo, range(options.seeds), options.run, quick=bool(tiny))
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -31,19 +31,25 @@ from rtd3jax.study.presets import ROVER_SETTINGS as SETTINGS
 from rtd3jax.study.presets import ROVER_STEPS as STEPS
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
+import continuing  # noqa: E402
 from effects import Effect  # noqa: E402
 from settings import mark, notes, setting_text  # noqa: E402
 from writing import (  # noqa: E402
     RESULTS,
     keep_curves,
     markdown_table,
+    mean_text,
     provenance,
+    say,
+    seeds_text,
     write_results,
 )
 
 SEEDS = 5
 EPISODES = 1_000
-PAPER_EPISODES = 20
+TINY = {"hidden_size": 4, "batch_size": 4, "learning_starts": 10}
+TINY |= {"eval_every": 60, "eval_episodes": 1}
+"""Fields of a small configuration, to test a script."""
 COLUMNS = (
     ("ar1-slip", "ar1-slip"),
     ("sine-slip", "ar1-slip"),
@@ -74,9 +80,7 @@ def train(run: pathlib.Path, steps: int, tiny: dict[str, object]) -> list[str]:
     cells = make_cells(PRESETS["rover"], {"total_steps": steps, **tiny})
     if tiny:
         cells = cells[:1]
-    seeds = range(1 if tiny else SEEDS)
-    study = rtd.Study(cells, seeds=seeds, out=run, final_episodes=1 if tiny else PAPER_EPISODES)
-    return study.run(quiet=bool(tiny), page=not tiny)
+    return continuing.train(cells, range(1 if tiny else SEEDS), run, quick=bool(tiny))
 
 
 def evaluate_policies(run: pathlib.Path, episodes: int, known: pd.DataFrame | None, setting: str):
@@ -116,9 +120,8 @@ def evaluate_policies(run: pathlib.Path, episodes: int, known: pd.DataFrame | No
                         "tested_on": tested,
                         "seed": seed,
                         "episodes": episodes,
-                        "mean": float(returns.mean()),
-                        "standard_error": float(returns.std(ddof=1) / np.sqrt(episodes)),
-                        "mean_of_20": float(returns[:PAPER_EPISODES].mean()),
+                        **continuing.mean_and_error(returns),
+                        "mean_of_20": float(returns[: continuing.FINAL_EPISODES].mean()),
                         "setting": setting,
                     }
                 )
@@ -156,10 +159,9 @@ def pick(rows: pd.DataFrame, algorithm: str, trained: str, tested: str) -> pd.Da
 def spread(here: pd.DataFrame, setting: str) -> str:
     """Mean ± standard deviation over seeds, and the number of seeds if some are missing."""
     values = here["mean"]
-    count = "" if len(values) == SEEDS else f" ({len(values)} of {SEEDS} seeds)"
-    deviation = f" ± {values.std(ddof=1):.2f}" if len(values) > 1 else ""
     older = int((here["setting"] != setting).sum())
-    return f"{values.mean():.2f}{deviation}{count}{mark(older, len(here))}"
+    few = seeds_text(len(values), SEEDS)
+    return f"{mean_text(values, 2)}{few}{mark(older, len(here))}"
 
 
 def table(rows: pd.DataFrame, others: dict[str, dict[str, str]], setting: str) -> str:
@@ -185,9 +187,10 @@ def fine_tuned() -> list[list[str]]:
         return []
     found = pd.read_parquet(path)
     found = found[found["way"] == "with critics and optimisers"]["mean"]
-    value = f"{found.mean():.2f} ± {found.std(ddof=1):.2f}"
     name = "**lstm-td3-1ha1hc**, then 5,000 steps on ar1-slip"
-    return [[name, *(value if c == ("sine-slip", "ar1-slip") else "–" for c in COLUMNS)]]
+    return [
+        [name, *(mean_text(found, 2) if c == ("sine-slip", "ar1-slip") else "–" for c in COLUMNS)]
+    ]
 
 
 def order(rows: pd.DataFrame) -> str:
@@ -237,9 +240,8 @@ def main(arguments: list[str] | None = None) -> int:
     began, steps, episodes = time.time(), options.steps, EPISODES
     tiny: dict[str, object] = {}
     if options.quick:
-        steps, episodes = 60, PAPER_EPISODES
-        tiny = {"hidden_size": 4, "batch_size": 4, "learning_starts": 10}
-        tiny |= {"eval_every": 60, "eval_episodes": 1}
+        steps, episodes = 60, continuing.FINAL_EPISODES
+        tiny = TINY
     if not options.report:
         for line in train(options.run, steps, tiny):
             print(line, file=sys.stderr)
@@ -264,9 +266,7 @@ def main(arguments: list[str] | None = None) -> int:
     write_results(options.out, "rover", rows, text, facts)
     draw(rows, options.out / "rover.png")
     keep_curves(options.run, options.out, "rover")
-    print(text)
-    for line in missing:
-        print(f"missing: {line}")
+    say(text, missing)
     return 0
 
 

@@ -27,10 +27,27 @@ from rtd3jax.study.plan import Grid, make_cells
 from rtd3jax.study.presets import ROVER_HISTORY_LENGTH, ROVER_SETTINGS, ROVER_STEPS
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-from rover import EPISODES, PAPER_EPISODES, SEEDS  # noqa: E402
+from continuing import (  # noqa: E402
+    FINAL_EPISODES,
+    joined,
+    kept,
+    mean_and_error,
+    not_in,
+    train_missing,
+    untested_policies,
+)
+from rover import EPISODES, SEEDS, TINY  # noqa: E402
 from rover import PAPER as PAPER_RETURNS  # noqa: E402
 from settings import setting_text  # noqa: E402
-from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
+from writing import (  # noqa: E402
+    RESULTS,
+    markdown_table,
+    mean_text,
+    provenance,
+    say,
+    seeds_text,
+    write_results,
+)
 
 SLIPS = ("ar1-slip", "sine-slip")
 TESTED_ON = "ar1-slip"
@@ -43,8 +60,6 @@ WITH_WINDOW = (
     "h-td3",
 )
 """The agent whose return differs most from the paper's comes first."""
-TINY = {"hidden_size": 4, "batch_size": 4, "learning_starts": 10}
-TINY |= {"eval_every": 60, "eval_episodes": 1}
 KEY = ["algorithm", "trained_on", "history_length", "seed"]
 COLUMNS = [*KEY, "steps", "episodes", "mean", "standard_error"]
 
@@ -67,44 +82,19 @@ def has(rows: pd.DataFrame, cell: rtd.Cell, seed: int) -> bool:
     return bool((rows[[*KEY, "steps"]] == list(key)).all(axis=1).any())
 
 
-def train(
-    run: pathlib.Path, cells: list[rtd.Cell], rows: pd.DataFrame, seeds: range, quiet: bool
-) -> list[str]:
-    """Train the cells that ``rows`` does not have; return a line for each lane that was lost."""
-    todo = [cell for cell in cells if not all(has(rows, cell, seed) for seed in seeds)]
-    print(f"the table has {len(cells) - len(todo)} of {len(cells)} cells", flush=True)
-    if not todo:
-        return []
-    episodes = 1 if quiet else PAPER_EPISODES
-    study = rtd.Study(todo, seeds=seeds, out=run, final_episodes=episodes)
-    return study.run(quiet=quiet, page=not quiet)
-
-
 def tested(
     run: pathlib.Path, cells: list[rtd.Cell], rows: pd.DataFrame, seeds: range, episodes: int
 ) -> tuple[list[dict[str, object]], list[str]]:
     """A row for each trained policy that ``rows`` does not have, and what is missing."""
-    env, found, missing = rtd.make("rover", TESTED_ON), [], set()
-    for cell in cells:
+    policies, missing = untested_policies(run, cells, rows, seeds, has)
+    env, found = rtd.make("rover", TESTED_ON), []
+    for cell, seed, policy in policies:
+        returns = np.asarray(rtd.evaluate(policy, env, episodes, seed=seed), np.float64)
         config = cell.config
-        for seed in (seed for seed in seeds if not has(rows, cell, seed)):
-            key = (config.algorithm, cell.disturbance, config.window_tokens, seed)
-            try:
-                policy = rtd.load_policy(
-                    run,
-                    algorithm=config.algorithm,
-                    disturbance=cell.disturbance,
-                    history_length=config.window_tokens,
-                    seed=seed,
-                )
-            except rtd.UserError as error:
-                missing.add(str(error))
-                continue
-            returns = np.asarray(rtd.evaluate(policy, env, episodes, seed=seed), np.float64)
-            error = float(returns.std(ddof=1) / np.sqrt(episodes))
-            values = (*key, config.total_steps, episodes, float(returns.mean()), error)
-            found.append(dict(zip(COLUMNS, values, strict=True)))
-    return found, sorted(missing)
+        key = (config.algorithm, cell.disturbance, config.window_tokens, seed)
+        values = (*key, config.total_steps, episodes)
+        found.append({**dict(zip(COLUMNS, values, strict=False)), **mean_and_error(returns)})
+    return found, missing
 
 
 def of_the_rover(results: pathlib.Path) -> pd.DataFrame:
@@ -139,9 +129,8 @@ def table(rows: pd.DataFrame) -> str:
                     line.append("no window")
                     continue
                 found = returns_of(rows, slip, algorithm, 0 if algorithm == "td3" else length)
-                few = "" if len(found) in (0, SEEDS) else f" ({len(found)} of {SEEDS} seeds)"
-                spread = f" ± {found.std(ddof=1):.3f}" if len(found) > 1 else ""
-                line.append(f"{found.mean():.3f}{spread}{few}" if len(found) else "not run")
+                few = seeds_text(len(found), SEEDS)
+                line.append(f"{mean_text(found, 3)}{few}" if len(found) else "not run")
             body.append([*line, PAPER_RETURNS[algorithm][column]])
     return markdown_table(header, body)
 
@@ -187,20 +176,17 @@ def main(arguments: list[str] | None = None) -> int:
     began, episodes, seeds = time.time(), EPISODES, range(SEEDS)
     tiny: dict[str, object] = {}
     if options.quick:
-        options.steps, episodes, seeds, tiny = 60, PAPER_EPISODES, range(1), TINY
+        options.steps, episodes, seeds, tiny = 60, FINAL_EPISODES, range(1), TINY
         options.lengths, options.slips = [3], ["ar1-slip"]
         options.algorithms = ["lstm-td3-no-action"]
-    path = options.out / "rover_lengths.parquet"
-    rows = pd.read_parquet(path) if path.exists() else pd.DataFrame(columns=COLUMNS)
+    rows = kept(options.out / "rover_lengths.parquet", COLUMNS)
     cells = wanted(options, tiny)
     if not options.report:
-        for line in train(options.run, cells, rows, seeds, quiet=options.quick):
+        todo = not_in(rows, cells, seeds, has)
+        for line in train_missing("the table", cells, todo, seeds, options.run, options.quick):
             print(line, file=sys.stderr)
     found, missing = tested(options.run, cells, rows, seeds, episodes)
-    if found:
-        new = pd.DataFrame(found)
-        rows = new if rows.empty else pd.concat([rows, new])
-        rows = rows.drop_duplicates(KEY, keep="last").reset_index(drop=True)
+    rows = joined(rows, found, KEY)
     if rows.empty:
         print(f"nothing is trained in {options.run} yet")
         return 1
@@ -218,9 +204,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     write_results(options.out, "rover_lengths", rows, text, facts)
     draw(both, best.mean, options.out)
-    print(text)
-    for line in missing:
-        print(f"missing: {line}")
+    say(text, missing)
     return 0
 
 

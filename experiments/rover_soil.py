@@ -29,14 +29,20 @@ from rtd3jax.study.presets import ROVER_SETTINGS as SETTINGS
 from rtd3jax.study.presets import ROVER_STEPS as STEPS
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-from rover import EPISODES, PAPER_EPISODES, SEEDS  # noqa: E402
+from continuing import (  # noqa: E402
+    joined,
+    kept,
+    mean_and_error,
+    not_in,
+    train_missing,
+    untested_policies,
+)
+from rover import EPISODES, SEEDS, TINY  # noqa: E402
 from rover_soil_report import GROUNDS, SLIPS, SOIL, UNTRAINED, draw, tables  # noqa: E402
-from writing import RESULTS, provenance, write_results  # noqa: E402
+from writing import RESULTS, provenance, say, write_results  # noqa: E402
 
 SOURCES = ("sine-slip", SOIL, "ar1-slip")
 """What agents are trained on, in an order that soon gives a useful table."""
-TINY = {"hidden_size": 4, "batch_size": 4, "learning_starts": 10}
-TINY |= {"eval_every": 60, "eval_episodes": 1}
 QUICK_STEPS, QUICK_EPISODES = 60, 20
 KEY = ["algorithm", "trained_on", "tested_on", "seed"]
 COLUMNS = [*KEY, "steps", "episodes", "mean", "standard_error"]
@@ -73,45 +79,25 @@ def has(rows: pd.DataFrame, cell: rtd.Cell, seed: int) -> bool:
     return set(tests_of(cell.disturbance)) <= set(own["tested_on"])
 
 
-def train(
-    run: pathlib.Path, cells: list[rtd.Cell], rows: pd.DataFrame, seeds: int, quiet: bool
-) -> list[str]:
-    """Train the cells that ``rows`` does not have; return a line for each lane that was lost."""
-    todo = [cell for cell in cells if not all(has(rows, cell, seed) for seed in range(seeds))]
-    print(f"the table has {len(cells) - len(todo)} of {len(cells)} cells", flush=True)
-    if not todo:
-        return []
-    episodes = 1 if quiet else PAPER_EPISODES
-    study = rtd.Study(todo, seeds=range(seeds), out=run, final_episodes=episodes)
-    return study.run(quiet=quiet, page=not quiet)
-
-
 def row_of(policy: object, tested_on: str, who: tuple, episodes: int) -> dict[str, object]:
     """Test ``policy``, which is (algorithm, trained on, seed, steps); the values of a row."""
     algorithm, trained_on, seed, steps = who
     env = rtd.make(*world(tested_on))
     returns = np.asarray(rtd.evaluate(policy, env, episodes, seed=seed), np.float64)
-    error = float(returns.std(ddof=1) / np.sqrt(episodes))
-    values = (algorithm, trained_on, tested_on, seed, steps, episodes, float(returns.mean()), error)
-    return dict(zip(COLUMNS, values, strict=True))
+    values = (algorithm, trained_on, tested_on, seed, steps, episodes)
+    return {**dict(zip(COLUMNS, values, strict=False)), **mean_and_error(returns)}
 
 
 def agents(
     run: pathlib.Path, cells: list[rtd.Cell], rows: pd.DataFrame, seeds: int, episodes: int
 ) -> tuple[list[dict], list[str]]:
     """A row for each test of a trained policy that ``rows`` does not have, and what is missing."""
-    found, missing = [], []
-    for cell in cells:
-        for seed in (seed for seed in range(seeds) if not has(rows, cell, seed)):
-            who = (cell.config.algorithm, cell.disturbance, seed)
-            try:
-                policy = rtd.load_policy(run, algorithm=who[0], disturbance=who[1], seed=seed)
-            except rtd.UserError as error:
-                missing.append(str(error))
-                continue
-            who = (*who, cell.config.total_steps)
-            found += [row_of(policy, name, who, episodes) for name in tests_of(cell.disturbance)]
-    return found, sorted(set(missing))
+    policies, missing = untested_policies(run, cells, rows, range(seeds), has)
+    found = []
+    for cell, seed, policy in policies:
+        who = (cell.config.algorithm, cell.disturbance, seed, cell.config.total_steps)
+        found += [row_of(policy, name, who, episodes) for name in tests_of(cell.disturbance)]
+    return found, missing
 
 
 def controllers(
@@ -135,19 +121,6 @@ def controllers(
     return found
 
 
-def kept(path: pathlib.Path) -> pd.DataFrame:
-    """The rows of an existing table."""
-    return pd.read_parquet(path) if path.exists() else pd.DataFrame(columns=COLUMNS)
-
-
-def joined(rows: pd.DataFrame, new: list[dict]) -> pd.DataFrame:
-    """``rows`` and ``new``, which replace rows with the same key."""
-    if not new:
-        return rows
-    both = pd.DataFrame(new) if rows.empty else pd.concat([rows, pd.DataFrame(new)])
-    return both.drop_duplicates(KEY, keep="last").reset_index(drop=True)
-
-
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
@@ -163,13 +136,15 @@ def main(arguments: list[str] | None = None) -> int:
     if options.quick:
         steps, episodes, seeds, tiny = QUICK_STEPS, QUICK_EPISODES, 1, TINY
         grounds, options.sources = (SOIL,), ["sine-slip", SOIL]
-    rows = kept(options.out / "rover_soil.parquet")
+    rows = kept(options.out / "rover_soil.parquet", COLUMNS)
     cells = wanted(options.sources, steps, tiny)
     if not options.report:
-        for line in train(options.run, cells, rows, seeds, quiet=options.quick):
+        todo = not_in(rows, cells, range(seeds), has)
+        where = options.run, options.quick
+        for line in train_missing("the table", cells, todo, range(seeds), *where):
             print(line, file=sys.stderr)
     found, missing = agents(options.run, cells, rows, seeds, episodes)
-    rows = joined(rows, [*found, *controllers(grounds, rows, seeds, episodes)])
+    rows = joined(rows, [*found, *controllers(grounds, rows, seeds, episodes)], KEY)
     facts = provenance(
         history_length=HISTORY_LENGTH,
         **{**SETTINGS, "total_steps": steps},
@@ -181,9 +156,7 @@ def main(arguments: list[str] | None = None) -> int:
     text = tables(rows, grounds, seeds)
     write_results(options.out, "rover_soil", rows, text, facts)
     draw(rows, grounds, options.out)
-    print(text)
-    for line in missing:
-        print(f"missing: {line}")
+    say(text, missing)
     return 0
 
 

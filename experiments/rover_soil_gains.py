@@ -19,6 +19,7 @@ from rtd3jax.envs.rover.controllers import target_pi
 from rtd3jax.envs.rover_soil.controllers import adaptive_slip
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
+from continuing import mean_and_error  # noqa: E402
 from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
 
 GROUND, SEED, EPISODES = "mixed-slope", 1000, 1_000
@@ -50,15 +51,7 @@ def main(arguments: list[str] | None = None) -> int:
     rows = []
     for controller, gains, policy in policies:
         returns = np.asarray(rtd.evaluate(policy, env, episodes, SEED), np.float64)
-        error = float(returns.std(ddof=1) / np.sqrt(episodes))
-        rows.append(
-            {
-                "controller": controller,
-                "gains": gains,
-                "mean": float(returns.mean()),
-                "standard_error": error,
-            }
-        )
+        rows.append({"controller": controller, "gains": gains, **mean_and_error(returns)})
         print(rows[-1], flush=True)
     table = pd.DataFrame(rows).sort_values(["controller", "mean"], ascending=[True, False])
     body = [

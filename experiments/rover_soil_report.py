@@ -18,7 +18,7 @@ sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from claims import BEST, on_the_rover  # noqa: E402
 from effects import combine, resampled_means  # noqa: E402
 from rover import pick  # noqa: E402
-from writing import markdown_table  # noqa: E402
+from writing import markdown_table, seeds_text  # noqa: E402
 
 SLIPS = ("ar1-slip", "sine-slip")
 GROUNDS = ("mixed", "mixed-slope", "dry-sand")
@@ -41,7 +41,7 @@ def text_of(values: np.ndarray, seeds: int) -> str:
     """Mean over seeds with its interval."""
     if not len(values):
         return "not trained yet"
-    count = "" if len(values) == seeds else f" ({len(values)} of {seeds} seeds)"
+    count = seeds_text(len(values), seeds)
     if len(values) == 1:
         return f"{values[0]:.3f}{count}"
     means = resampled_means(values, np.random.default_rng(0))

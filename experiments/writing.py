@@ -8,6 +8,7 @@ import platform
 import shutil
 
 import jax
+import numpy as np
 import pandas as pd
 
 RESULTS = pathlib.Path(__file__).parent / "results"
@@ -40,6 +41,24 @@ def keep_curves(run: pathlib.Path, out: pathlib.Path, name: str) -> None:
     drawn = run / "learning_curves.png"
     if drawn.exists():
         shutil.copyfile(drawn, out / f"{name}_learning_curves.png")
+
+
+def mean_text(values: pd.Series | np.ndarray, digits: int) -> str:
+    """The mean of values, and their standard deviation if there are several."""
+    spread = f" ± {values.std(ddof=1):.{digits}f}" if len(values) > 1 else ""
+    return f"{values.mean():.{digits}f}{spread}"
+
+
+def seeds_text(count: int, seeds: int) -> str:
+    """A remark that only ``count`` of the seeds are there; empty if all are."""
+    return "" if count == seeds else f" ({count} of {seeds} seeds)"
+
+
+def say(text: str, missing: list[str]) -> None:
+    """Print the text of a table, and a line for each thing that it lacks."""
+    print(text)
+    for line in missing:
+        print(f"missing: {line}")
 
 
 def markdown_table(header: list[str], rows: list[list[str]]) -> str:

@@ -44,6 +44,10 @@ WINDOWS_WITH_CARRY = (
 )
 
 
+_FOLLOWS = {"actor_starts": "learning_starts", "replay_capacity": "total_steps"}
+"""Fields that are None by default, and the fields whose values they then have."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Config:
     """All settings of one agent's training, except the environment and the seed.
@@ -399,7 +403,7 @@ class Config:
     @property
     def first_actor_step(self) -> int:
         """The environment step from which on the actor is updated."""
-        return self.learning_starts if self.actor_starts is None else self.actor_starts
+        return self._followed("actor_starts")
 
     @property
     def updates_before_the_actor(self) -> int:
@@ -409,12 +413,15 @@ class Config:
     @property
     def capacity(self) -> int:
         """Transitions that the replay keeps."""
-        return self.total_steps if self.replay_capacity is None else self.replay_capacity
+        return self._followed("replay_capacity")
+
+    def _followed(self, name: str) -> int:
+        value: int | None = getattr(self, name)
+        return getattr(self, _FOLLOWS[name]) if value is None else value
 
     def to_dict(self) -> dict[str, Any]:
         """The fields as JSON-ready values, with the defaults that depend on other fields."""
-        fields = dataclasses.asdict(self)
-        return {**fields, "actor_starts": self.first_actor_step, "replay_capacity": self.capacity}
+        return {**dataclasses.asdict(self), **{name: self._followed(name) for name in _FOLLOWS}}
 
     @classmethod
     def from_dict(cls, fields: Mapping[str, Any]) -> "Config":
@@ -428,10 +435,9 @@ class Config:
             TypeError: when there is no such field.
         """
         given = dict(fields)
-        if given.get("actor_starts") == given.get("learning_starts", cls.learning_starts):
-            del given["actor_starts"]
-        if given.get("replay_capacity") == given.get("total_steps", cls.total_steps):
-            given.pop("replay_capacity", None)
+        for name, other in _FOLLOWS.items():
+            if given.get(name) == given.get(other, getattr(cls, other)):
+                del given[name]
         return cls(**given)
 
 

@@ -42,7 +42,7 @@ def test_a_history_length_on_td3_warns():
 
 def test_a_resolved_configuration_is_a_fixed_point():
     config = rtd.Config(algorithm="h-td3")
-    assert dataclasses.replace(config) == config
+    assert dataclasses.replace(config) == config and config.capacity == config.total_steps
 
 
 def test_the_replay_is_as_large_as_the_training_unless_it_is_told_its_size():
