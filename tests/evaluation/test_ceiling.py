@@ -9,7 +9,8 @@ import pytest
 from scipy import stats
 
 import rtd3jax as rtd
-from rtd3jax.envs.rover.optimum import clipped_normal_moments
+from rtd3jax.envs.rover.environment import RoverParams
+from rtd3jax.envs.rover.optimum import best_command, clipped_normal_moments
 
 
 @pytest.mark.parametrize("mean", [0.0, 0.1, 0.25, 0.45, 0.5])
@@ -18,6 +19,61 @@ def test_moments_equal_quadrature(mean, deviation):
     grid = stats.norm.ppf((np.arange(200_000) + 0.5) / 200_000, mean, deviation).clip(0, 0.5)
     got = clipped_normal_moments(*map(jnp.float32, (mean, deviation, 0.5)))
     np.testing.assert_allclose(got, (grid.mean(), (grid**2).mean()), atol=2e-6)
+
+
+@pytest.mark.parametrize("mean", [-0.1, 0.3, 0.7])
+def test_moments_without_noise_are_those_of_a_number(mean):
+    got = clipped_normal_moments(*map(jnp.float32, (mean, 0.0, 0.5)))
+    value = min(max(mean, 0.0), 0.5)
+    np.testing.assert_allclose(got, (value, value**2), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "task",
+    [
+        {},
+        {"target_speed": 0.9},
+        {"target_speed": 0.9, "target_yaw_rate": -0.8},
+        {"target_speed": 0.2, "max_yaw_rate": 0.05, "target_yaw_rate": 0.3},
+    ],
+)
+@pytest.mark.parametrize("slips", [(0.1, 0.2), (0.45, 0.1), (0.6, 0.75)])
+def test_no_command_within_the_bounds_is_better(task, slips):
+    params, deviation, draws = RoverParams(**task), 0.05, 4_000
+    traction = 1 - np.random.default_rng(0).normal(slips, deviation, (draws, 2)).clip(0, 1)
+    moments = traction.mean(0), (traction[:, :1] ** 2).mean(0), (traction[:, 1:] ** 2).mean(0)
+
+    def loss(speed, yaw_rate):
+        """Expected squared error, by the moments of independent wheels."""
+        base = params.wheelbase
+        left, right = speed - base / 2 * yaw_rate, speed + base / 2 * yaw_rate
+        squares = moments[1] * left**2 + moments[2] * right**2
+        product = moments[0][0] * moments[0][1] * left * right
+        means = moments[0][0] * left, moments[0][1] * right
+        v, w = sum(means) / 2, (means[1] - means[0]) / base
+        v2, w2 = (squares + 2 * product) / 4, (squares - 2 * product) / base**2
+        targets = params.target_speed, params.target_yaw_rate
+        return v2 - 2 * targets[0] * v + w2 - 2 * targets[1] * w
+
+    limit = params.max_speed, params.max_yaw_rate
+    grid = np.meshgrid(*(np.linspace(-bound, bound, 801) for bound in limit))
+    least = loss(*grid).min()
+    second = np.concatenate(moments[1:])
+    command = best_command(params, *map(jnp.float32, (moments[0], second)))
+    assert np.all(np.abs(command) <= np.asarray(limit, np.float32))
+    assert loss(*np.asarray(command, np.float64)) == pytest.approx(least, abs=1e-5)
+
+
+def test_the_slip_is_inferred_from_a_command_at_its_bound():
+    env = rtd.make("rover", disturbance="ar1-slip", target_speed=1.5)
+    policy = rtd.bayes_policy(env)
+    observation, state = env.reset(jax.random.key(3))
+    met = state.slip.slip
+    action, memory = policy.step(policy.init(), observation)
+    assert float(action[0]) == 1.0
+    observation, *_ = env.step(jax.random.key(0), state, action)
+    _, after = policy.step(memory, observation)
+    np.testing.assert_allclose(after.slip, met, atol=1e-5)
 
 
 def test_the_slip_is_inferred_exactly():

@@ -2,9 +2,11 @@
 
 The slip does not depend on the actions, and the motion has no inertia, so the optimal policy is
 myopic. The last action and the observation determine the last slip exactly. The optimal command
-minimises the expected squared error, which the conditional moments of the next slip determine.
+minimises, within its bounds, the expected squared error, which the conditional moments of the next
+slip determine.
 """
 
+import itertools
 from typing import NamedTuple
 
 import jax
@@ -14,9 +16,10 @@ from flax import struct
 from jax.scipy.stats import norm
 
 from rtd3jax.envs.description import Ceiling
-from rtd3jax.envs.processes.process import NoDisturbance, Process
+from rtd3jax.envs.processes.process import NoDisturbance, Process, float32
 from rtd3jax.envs.rover.environment import Rover, RoverParams
 from rtd3jax.envs.rover.slip import WHEELS, Ar1Slip, SineSlip
+from rtd3jax.envs.rover.task import limits, sides
 from rtd3jax.errors import UserError
 from rtd3jax.protocols import EnvironmentLike
 
@@ -52,10 +55,8 @@ class BayesPolicy:
         params = self.params
         slip = _inferred_slip(params, state, observation)
         first, second = _traction_moments(self.model, slip, state.time == 0)
-        nominal = _best_wheel_speeds(params, first, second)
-        speed = 0.5 * (nominal[0] + nominal[1])
-        yaw_rate = (nominal[1] - nominal[0]) / params.wheelbase
-        action = jnp.stack((speed, yaw_rate)).astype(jnp.float32)
+        action = best_command(params, first, second)
+        nominal = sides(action[0], action[1], float32(params.wheelbase))
         return action, BayesState(nominal, slip, state.time + jnp.int32(1))
 
 
@@ -110,8 +111,8 @@ def _sine_bound(params: RoverParams, episodes: int, seed: int) -> Ceiling:
     horizon = params.max_steps_in_episode
     slip = jax.vmap(lambda key: params.slip.init(key, horizon, WHEELS).slip)(keys)
     traction = 1.0 - slip
-    nominal = _best_wheel_speeds(params, traction.mean(0), (traction**2).mean(0))
-    realised = traction * nominal[None, :]
+    command = best_command(params, traction.mean(0), (traction**2).mean(0))
+    realised = traction * sides(command[0], command[1], float32(params.wheelbase))[None, :]
     speed = realised.mean(axis=1)
     yaw_rate = (realised[:, 1] - realised[:, 0]) / params.wheelbase
     losses = (speed - params.target_speed) ** 2 + (yaw_rate - params.target_yaw_rate) ** 2
@@ -150,7 +151,10 @@ def _traction_moments(
 def clipped_normal_moments(
     mean: jax.Array, deviation: jax.Array, top: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """E[y] and E[y^2] of ``y = clip(N(mean, deviation^2), 0, top)``, with deviation > 0."""
+    """E[y] and E[y^2] of ``y = clip(N(mean, deviation^2), 0, top)``, with deviation >= 0."""
+    certain = jnp.clip(mean, 0.0, top)
+    random = deviation > 0.0
+    deviation = jnp.where(random, deviation, 1.0)
     a, b = (0.0 - mean) / deviation, (top - mean) / deviation
     inside = norm.cdf(b) - norm.cdf(a)
     slope = norm.pdf(a) - norm.pdf(b)
@@ -163,26 +167,44 @@ def clipped_normal_moments(
         + deviation**2 * curve
         + top**2 * above
     )
-    return first, second
+    return jnp.where(random, first, certain), jnp.where(random, second, certain**2)
 
 
-def _best_wheel_speeds(params: RoverParams, first: jax.Array, second: jax.Array) -> jax.Array:
-    """Nominal wheel speeds [2] that minimise the expected squared error of the motion.
+def best_command(params: RoverParams, first: jax.Array, second: jax.Array) -> jax.Array:
+    """The command [2] within its bounds with the least expected squared error of the motion.
 
     With tractions x and wheel speeds u the motion is v = (x_L u_L + x_R u_R)/2 and
-    omega = (x_R u_R - x_L u_L)/b; the wheels slip independently, so the expectation is a quadratic
-    whose minimum solves two linear equations. The bounds of the command are so wide that they are
-    never active.
+    omega = (x_R u_R - x_L u_L)/b; the wheels slip independently, so the expectation is a convex
+    quadratic of the command. Its minimum in the rectangle of commands is the free minimum, or on
+    one of the four edges.
+
+    Args:
+        params: the rover.
+        first: E[x], [2].
+        second: E[x^2], [2].
     """
-    sum_weight, difference_weight = 0.25, 1.0 / params.wheelbase**2
+    base = float32(params.wheelbase)
+    sum_weight, difference_weight = 0.25, 1.0 / base**2
     cross = (sum_weight - difference_weight) * first[0] * first[1]
     diagonal = (sum_weight + difference_weight) * second
     matrix = jnp.stack((jnp.stack((diagonal[0], cross)), jnp.stack((cross, diagonal[1]))))
-    turn = params.target_yaw_rate / params.wheelbase
-    right = first * jnp.stack(
-        (
-            jnp.float32(0.5 * params.target_speed - turn),
-            jnp.float32(0.5 * params.target_speed + turn),
-        )
+    turn = params.target_yaw_rate / base
+    right = first * jnp.stack((0.5 * params.target_speed - turn, 0.5 * params.target_speed + turn))
+    # The same quadratic, c'Ac - 2 g'c, of the command c = (speed, yaw rate).
+    to_wheels = jnp.stack(
+        (jnp.stack((jnp.float32(1.0), -0.5 * base)), jnp.stack((jnp.float32(1.0), 0.5 * base)))
     )
-    return jnp.linalg.solve(matrix, right[:, None])[:, 0]
+    curvature, linear = to_wheels.T @ matrix @ to_wheels, to_wheels.T @ right
+    limit = limits(params)
+    free = jnp.linalg.solve(curvature, linear[:, None])[:, 0]
+    candidates = [free]
+    for fixed, bound in itertools.product((0, 1), (-limit, limit)):
+        other = 1 - fixed
+        slope = linear[other] - curvature[fixed, other] * bound[fixed]
+        rest = jnp.clip(slope / curvature[other, other], -limit[other], limit[other])
+        candidates.append(jnp.stack((bound[0], rest) if fixed == 0 else (rest, bound[1])))
+    commands = jnp.stack(candidates)
+    losses = jnp.sum((commands @ curvature - 2.0 * linear[None, :]) * commands, axis=1)
+    outside = jnp.any(jnp.abs(free) > limit)
+    losses = losses.at[0].set(jnp.where(outside, jnp.inf, -jnp.inf))
+    return commands[jnp.argmin(losses)]
