@@ -101,9 +101,17 @@ class Checkpoints:
                 ) from error
             for old in [*checkpoint_files(directory)[kept:], *_unfinished(directory)]:
                 old.unlink(missing_ok=True)
-        now = time.monotonic()
-        self._written[id(group)] = (now, step)
-        self._cost[id(group)] = now - began
+        self.note(group, step)
+        self._cost[id(group)] = time.monotonic() - began
+
+    def note(self, group: Any, step: int) -> None:
+        """Note that each lane of ``group`` has a checkpoint at ``step``."""
+        self._written[id(group)] = (time.monotonic(), step)
+
+    def save_once(self, group: Any) -> None:
+        """Write a checkpoint of each lane of ``group``, unless its last one is at this step."""
+        if self._written.get(id(group), (0.0, None))[1] != group.step:
+            self.save(group.lanes(), group, group.step)
 
     def restore(self, jobs: list[Any]) -> tuple[list[LaneState], int] | None:
         """The states at the newest step with a valid checkpoint of every lane, and this step.

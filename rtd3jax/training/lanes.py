@@ -173,8 +173,9 @@ def advance_groups(
 
     If a group raises an error, the group keeps it, and the other groups continue. After an
     interrupt, the workers finish their current chunks, and the interrupt is raised again. With
-    ``checkpoints``, groups continue from their checkpoints, and write new ones at intervals and
-    after an interrupt. ``devices`` has a device for each worker, by default those of `workers`.
+    ``checkpoints``, groups continue from their checkpoints, and write new ones at intervals; at the
+    end or after an interrupt, each group whose ``state`` is not None has one at its last step.
+    ``devices`` has a device for each worker, by default those of `workers`.
     """
     pool = _Pool(groups)
     threads = [
@@ -194,9 +195,10 @@ def advance_groups(
                     thread.join()
     finally:
         if checkpoints is not None:
+            # A group that has ended, but is not recorded yet, still has its state.
             for group in groups:
-                if group.state is not None and not group.finished:
-                    checkpoints.save(group.lanes(), group, group.step)
+                if group.state is not None and group.error is None:
+                    checkpoints.save_once(group)
 
 
 @contextlib.contextmanager
@@ -316,6 +318,7 @@ def _restore(group: Group, checkpoints: Checkpoints) -> None:
         single = len(states) == 1
         state = states[0] if single else jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
         _advanced(group, state, step)
+        checkpoints.note(group, step)
 
 
 def _advanced(group: Group, state: LaneState, step: int) -> None:

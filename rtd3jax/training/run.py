@@ -203,11 +203,14 @@ def train(
         return f"{own.algorithm} l={own.history_length}{number}"
 
     with Progress(groups, label, enabled=progress, remark=remark) as bar:
-        advance_groups(groups, bar.update, checkpoints)
-    if checkpoints is not None:
-        for group in groups:
-            if group.error is None:
-                checkpoints.save(group.lanes(), group, group.step)
+
+        def on_chunk(group: Group) -> None:
+            bar.update(group)
+            # Other lanes may train for hours before this call ends.
+            if checkpoints is not None and group.finished and group.error is None:
+                checkpoints.save_once(group)
+
+        advance_groups(groups, on_chunk, checkpoints)
     lanes = _ended(groups)
     runs = [
         collect(one, seeds, {seed: lanes[index, seed] for seed in seeds})

@@ -8,6 +8,7 @@ import pytest
 
 import rtd3jax as rtd
 from rtd3jax.training import lanes, run
+from rtd3jax.training.checkpoint import Checkpoints
 
 CONFIG = rtd.Config(
     algorithm="h-td3",
@@ -74,6 +75,41 @@ def test_an_interrupted_training_goes_on_to_the_same_bits(stopped, whole):
 def test_a_finished_training_is_not_repeated(tmp_path, whole, monkeypatch):
     _train(tmp_path)
     monkeypatch.setattr(lanes, "_chunk", lambda *_: pytest.fail("trained again"))
+    _assert_same(_train(tmp_path), whole)
+
+
+def test_a_lane_that_has_ended_is_kept_while_others_train(tmp_path, whole, monkeypatch):
+    """As if the process were killed: nothing is written after the first lane has ended."""
+
+    class Killed(BaseException):
+        pass
+
+    kept = []
+
+    def update(self, group):
+        kept.extend(tmp_path.rglob(f"step-{CONFIG.total_steps:09d}.safetensors"))
+        if kept:
+            monkeypatch.setattr(Checkpoints, "save", lambda *_: None)
+            raise Killed
+
+    longer = dataclasses.replace(CONFIG, algorithm="lstm-td3")
+    with monkeypatch.context() as patch:
+        patch.setattr(run.Progress, "update", update)
+        with pytest.raises(Killed):
+            _train(tmp_path, [CONFIG, longer])
+    assert len(kept) >= 1
+
+
+def test_a_lane_that_has_ended_and_is_not_recorded_has_a_checkpoint(tmp_path, whole, monkeypatch):
+    def interrupt(self, group):
+        if group.finished:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(run.Progress, "update", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            _train(tmp_path)
+    assert list(tmp_path.rglob(f"step-{CONFIG.total_steps:09d}.safetensors"))
     _assert_same(_train(tmp_path), whole)
 
 
