@@ -52,8 +52,15 @@ def lock(handle: int, *, shared: bool = False, wait: bool = False) -> None:
 
 def open_for_locking(path: Path, *, create: bool = True) -> int:
     """Open the file, which must not be a link; `os.close` releases its locks."""
-    flags = os.O_RDWR | os.O_CREAT if create else os.O_RDONLY
-    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
+    flags = os.O_RDWR | getattr(os, "O_NOFOLLOW", 0)
+    if create:
+        return os.open(path, flags | os.O_CREAT, 0o666)
+    try:  # NFS only locks files that are open for writing
+        return os.open(path, flags)
+    except OSError as error:
+        if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS):
+            raise
+        return os.open(path, flags & ~os.O_RDWR | os.O_RDONLY)
 
 
 def _lock_bytes(handle: int, shared: bool, wait: bool) -> None:

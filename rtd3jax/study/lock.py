@@ -4,6 +4,7 @@ The operating system releases a lock when its process ends for any reason.
 """
 
 import contextlib
+import errno
 import os
 import re
 import time
@@ -64,6 +65,10 @@ def is_held(directory: Path) -> bool:
             lock(handle)
     except BlockingIOError:
         return True
+    except OSError as error:
+        if error.errno != errno.EBADF:
+            raise
+        return False  # a directory on NFS that this user may only read: nobody can tell
     else:
         return False
     finally:

@@ -86,3 +86,27 @@ def test_other_errors_are_not_hidden(handles, monkeypatch):
     monkeypatch.setattr(filelock.fcntl, "flock", flock)
     with pytest.raises(OSError, match="Input/output"):
         filelock.lock(handles[0])
+
+
+def test_a_file_system_that_only_locks_files_open_for_writing(tmp_path, monkeypatch):
+    """As NFS; see flock(2)."""
+    real = filelock.fcntl.flock
+
+    def flock(handle, kind):
+        if filelock.fcntl.fcntl(handle, filelock.fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY:
+            raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+        real(handle, kind)
+
+    monkeypatch.setattr(filelock.fcntl, "flock", flock)
+    with writer(tmp_path, None):
+        assert is_held(tmp_path)
+    assert not is_held(tmp_path)
+    real_open = os.open
+
+    def only_for_reading(path, flags, *mode):
+        if flags & os.O_RDWR:
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        return real_open(path, flags, *mode)
+
+    monkeypatch.setattr(os, "open", only_for_reading)
+    assert not is_held(tmp_path)
