@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,7 +16,7 @@ import pytest
 from rtd3jax import sweep
 from rtd3jax.study import finish, recorder, references
 from rtd3jax.study.derive import derive
-from rtd3jax.study.log import LOG, read_log
+from rtd3jax.study.log import LOG, lane_of, read_log
 from rtd3jax.study.rundir import RunDirectory
 
 STUDY = [
@@ -316,3 +317,20 @@ def test_a_directory_that_cannot_be_written_is_one_line(tmp_path, capsys, monkey
     assert run(tmp_path / "run") == 2
     error = capsys.readouterr().err
     assert "Read-only file system" in error and error.count("\n") == 1
+
+
+def test_a_lane_that_is_trained_anew_is_logged_again(whole, tmp_path):
+    out = tmp_path / "run"
+    shutil.copytree(whole, out)
+    rows = read_log(out / LOG)
+    first = rows[0]
+    text = json.dumps({**first, "return": first["return"] + 1.0}) + "\n"
+    text += "".join(json.dumps(row) + "\n" for row in rows[1:])
+    (out / LOG).write_text(text)
+    shutil.rmtree(out / "lanes")
+    assert run(out) == 0
+    again = read_log(out / LOG)
+    assert len(again) == len(rows) + 1
+    (added,) = again[len(rows) :]
+    assert (lane_of(added), added["step"]) == (lane_of(first), first["step"])
+    assert added["return"] == first["return"]

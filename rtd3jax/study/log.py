@@ -10,12 +10,19 @@ from rtd3jax.study.results import CELL
 LOG = "log.jsonl"
 
 
-def repair_log(path: Path) -> set[tuple[Any, ...]]:
-    """Complete a truncated last line; return the lanes and steps in the log."""
+def append_rows(path: Path, rows: Iterable[dict[str, Any]]) -> None:
+    """Append rows in a single write, so that rows of other processes are not mixed with them."""
+    if lines := "".join(json.dumps(row) + "\n" for row in rows):
+        with path.open("ab", buffering=0) as log:
+            log.write(lines.encode())
+
+
+def repair_log(path: Path) -> dict[tuple[Any, ...], Any]:
+    """Complete a truncated last line; return the last return of each lane and step in the log."""
     if path.exists() and not path.read_bytes().endswith(b"\n"):
         with path.open("a", encoding="utf-8") as file:
             file.write("\n")
-    return {(*lane_of(row), row["step"]) for row in read_log(path)}
+    return {(*lane_of(row), row["step"]): row.get("return") for row in read_log(path)}
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:

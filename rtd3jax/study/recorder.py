@@ -1,13 +1,13 @@
 """Writes the files of lanes when they end, and the log during training."""
 
-import json
+import math
 import time
 
 import numpy as np
 
 from rtd3jax.evaluation.rollout import both_returns
 from rtd3jax.study.interim import InterimResults
-from rtd3jax.study.log import LOG, repair_log
+from rtd3jax.study.log import LOG, append_rows, repair_log
 from rtd3jax.study.loggers import Logger
 from rtd3jax.study.plan import label
 from rtd3jax.study.rundir import RunDirectory
@@ -72,30 +72,35 @@ class Recorder:
 
     def _log(self, group: Group) -> None:
         assert group.returns is not None and group.metrics is not None
-        with (self._directory.path / LOG).open("a", encoding="utf-8") as log:
-            for index, job in enumerate(group.jobs):
-                cell, seed = job.key
-                curve, steps = group.returns[index], evaluation_steps(cell.config)
-                reached = int(np.sum(steps <= group.step))
-                for k in range(self._logged.get(id(job), 0), reached):
-                    lane = {**cell.key, "seed": seed, "step": int(steps[k])}
-                    if tuple(lane.values()) in self._there:
-                        continue  # the log has this row from before a restart
-                    row = {
-                        **lane,
-                        "return": _json_number(curve[k]),
-                        "seconds": round(time.perf_counter() - self._began, 3),
-                        "metrics": {
-                            name: _json_number(value)
-                            for name, value in zip(
-                                job.program.metric_names, group.metrics[index, k], strict=True
-                            )
-                        },
-                    }
-                    log.write(json.dumps(row) + "\n")
-                    if self._logger is not None:
-                        self._logger.log(cell, seed, row)
-                self._logged[id(job)] = reached
+        rows = []
+        for index, job in enumerate(group.jobs):
+            cell, seed = job.key
+            curve, steps = group.returns[index], evaluation_steps(cell.config)
+            reached = int(np.sum(steps <= group.step))
+            for k in range(self._logged.get(id(job), 0), reached):
+                lane, value = (
+                    {**cell.key, "seed": seed, "step": int(steps[k])},
+                    _json_number(curve[k]),
+                )
+                there = self._there.get(tuple(lane.values()), math.nan)
+                if there == value:
+                    continue  # from before a restart; a lane that is trained anew may differ
+                row = {
+                    **lane,
+                    "return": value,
+                    "seconds": round(time.perf_counter() - self._began, 3),
+                    "metrics": {
+                        name: _json_number(value)
+                        for name, value in zip(
+                            job.program.metric_names, group.metrics[index, k], strict=True
+                        )
+                    },
+                }
+                rows.append(row)
+                if self._logger is not None:
+                    self._logger.log(cell, seed, row)
+            self._logged[id(job)] = reached
+        append_rows(self._directory.path / LOG, rows)
 
     def _keep(self, job: Job, state: LaneState) -> None:
         cell, seed = job.key
