@@ -7,11 +7,12 @@ prints a Markdown table; with --out DIR it also writes DIR/compare.parquet and D
 import argparse
 from collections.abc import Sequence
 
-from rtd3jax.cli.common import exit_status, replace_unprintable
+from rtd3jax.cli.common import add_import, exit_status, replace_unprintable
 from rtd3jax.errors import UserError
 from rtd3jax.study.comparison import MEASURES, compare_runs, comparison_markdown, differing_settings
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.system.files import user_path, write_bytes_atomically
+from rtd3jax.system.imports import import_modules
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -21,6 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
+    import_modules(options.imports)
     directories = [RunDirectory.open(run) for run in options.runs]
     names = _short_names([str(directory.path.resolve()) for directory in directories])
     measure = MEASURES[options.true_return]
@@ -66,4 +68,5 @@ def _parser() -> argparse.ArgumentParser:
         help="compare returns computed from the undisturbed state, not from the reward that the "
         "agent received",
     )
+    add_import(parser)
     return parser

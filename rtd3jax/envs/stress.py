@@ -54,7 +54,7 @@ class Stress:
             raise UserError(
                 f"stress {self.name}: values={self.values!r} must be a tuple of finite numbers"
             )
-        object.__setattr__(self, "values", values)
+        object.__setattr__(self, "values", tuple(dict.fromkeys(values)))  # 0.1 and 0.10 are one
         object.__setattr__(self, "quantity", self.quantity or self.name)
 
 

@@ -34,7 +34,7 @@ def run_robustness(
             default. In a run of several environments, a stress may be unknown to some of them.
         episodes: number of episodes for each policy and value. The seed of a lane is also the seed
             of its episodes, so agents with the same seed meet the same episodes.
-        say: receives a line if a stress does not fit an environment.
+        say: receives a line if a stress does not fit an environment, or a lane has no policy.
 
     Raises:
         UserError: for an unknown stress or an impossible value, or when nothing is trained yet.
@@ -56,10 +56,16 @@ def run_robustness(
         own = cases.get((cell.env, cell.disturbance))
         if own is None:
             continue
-        policy = directory.lanes.policy(cell, seed)
+        try:
+            policy = directory.lanes.policy(cell, seed)
+        except UserError as error:  # lost in training, or its file is damaged
+            say(f"not tested: {error}")
+            continue
         check_policy(policy, own)
         identity = {**cell.key, "seed": seed}
         rows += [{**identity, **row} for row in rows_of(policy, own, episodes, seed)]
+    if not rows:
+        raise UserError(f"no policy in {directory.path} could be tested: --status prints the lanes")
     table = pd.DataFrame(rows, columns=list(COLUMNS))
     write_bytes_atomically(directory.path / FILE, table.to_parquet(index=False))
     return table

@@ -1,6 +1,7 @@
 """Compares the comparison of runs with results by hand, and tests its command."""
 
 import re
+import sys
 
 import numpy as np
 import pandas as pd
@@ -140,3 +141,10 @@ def test_a_run_without_results_and_no_run_are_one_line(runs, tmp_path, capsys):
     file.write_text("")
     assert command.main([runs["before"], runs["after"], "--out", str(file)]) == 2
     assert "is a file: --out must name a directory" in capsys.readouterr().err
+
+
+def test_agents_of_a_module_can_be_imported(runs, tmp_path, monkeypatch):
+    (tmp_path / "own_agents.py").write_text("LOADED = True\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    chosen = [runs["before"], runs["after"], "--import", "own_agents"]
+    assert command.main(chosen) == 0 and sys.modules.pop("own_agents").LOADED

@@ -1,5 +1,7 @@
 """Tests the robustness of a run: its command, table, picture and charts."""
 
+import shutil
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -121,3 +123,18 @@ def test_mistakes_are_one_line(run, tmp_path, capsys):
     assert "there is no study" in message(str(tmp_path / "nowhere"))
     (tmp_path / "config.json").write_bytes((run / "config.json").read_bytes())
     assert "has no finished lane" in message(str(tmp_path))
+
+
+def test_a_lost_lane_does_not_stop_the_others(run, tmp_path, capsys):
+    shutil.copytree(run, tmp_path / "run")
+    directory = RunDirectory.open(tmp_path / "run")
+    (cell, *_), (seed, *_) = directory.cells, directory.seeds
+    policy, path = directory.lanes.policy(cell, seed), directory.lanes.lane_path(cell, seed)
+    failure = {"step": 3, "reason": "the critic loss is NaN"}
+    directory.lanes.write_lane(cell, seed, policy.parameters(), {}, {}, failure)
+    assert path.exists() and directory.lanes.is_lost(cell, seed)
+    options = ["--episodes", "3", "--stresses", "delay=0,2,2.0"]
+    assert stress.main([str(tmp_path / "run"), *options]) == 0
+    assert "seed 0 was lost in training: the critic loss is NaN" in capsys.readouterr().out
+    table = pd.read_parquet(tmp_path / "run" / "robustness.parquet")
+    assert len(table) == 3 * 2  # three lanes; 2 and 2.0 are one value
