@@ -62,10 +62,14 @@ def both_returns(
     return unchecked_returns(policy, env, int(episodes), int(seed), params)
 
 
-def check_counts(episodes: int, seed: int) -> None:
+def check_counts(episodes: int, seed: int, name_of_episodes: str = "episodes") -> None:
     """Raise UserError for an impossible number of episodes or an impossible seed."""
-    for name, value, low in (("episodes", episodes, 1), ("seed", seed, 0)):
-        if isinstance(value, bool) or value != int(value) or not low <= value < 2**32:
+    for name, value, low in ((name_of_episodes, episodes, 1), ("seed", seed, 0)):
+        try:
+            whole = not isinstance(value, bool) and value == int(value)
+        except (TypeError, ValueError, OverflowError):
+            whole = False
+        if not whole or not low <= value < 2**32:
             raise UserError(f"{name} must be an integer of at least {low}, not {value!r}")
 
 

@@ -6,6 +6,7 @@ derived from these files.
 """
 
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -145,8 +146,22 @@ class LaneFiles:
         write_bytes_atomically(self.error_path(cell, seed), (reason + "\n").encode())
 
 
+def check_names(cells: Iterable[Cell]) -> None:
+    """Raise UserError if two cells have the same directory name."""
+    names: dict[str, Cell] = {}
+    for cell in cells:
+        other = names.setdefault(cell_name(cell), cell)
+        if other.key != cell.key:
+            before, after = (" ".join(map(str, one.key.values())) for one in (other, cell))
+            raise UserError(
+                f"the files of {before} and of {after} would have the same name, "
+                f"{cell_name(cell)}: rename an environment or a disturbance, or put them in "
+                "separate studies"
+            )
+
+
 def cell_name(cell: Cell) -> str:
-    """The unique directory name of a cell."""
+    """The directory name of a cell; it is unique in a study, see `check_names`."""
     length = f"l{cell.config.history_length}"
     return file_name(cell.env, cell.disturbance, cell.config.algorithm, length)
 

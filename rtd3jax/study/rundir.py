@@ -25,7 +25,7 @@ from rtd3jax.study.contents import (
     longer_cells,
     read_config,
 )
-from rtd3jax.study.lane_files import LaneFiles, cell_name
+from rtd3jax.study.lane_files import LaneFiles, cell_name, check_names
 from rtd3jax.study.lock import writer
 from rtd3jax.study.plan import Cell
 from rtd3jax.system.files import (
@@ -102,6 +102,7 @@ class RunDirectory:
         """
         config = self.path / CONFIG
         if not config.exists():
+            check_names(self.cells)
             return ""
         there = Contents.read(config)
         try:
@@ -114,6 +115,7 @@ class RunDirectory:
         self._check_longer(there)
         self._check_format(config)
         if self.contents != there:
+            check_names(self.cells)
             return f"added to {self.path}: {additions_text(there, self.contents)}"
         if extended(self._asked, there) != self._asked:
             return (
@@ -125,45 +127,50 @@ class RunDirectory:
     def prepare(self) -> str:
         """Create the directory, or extend its study; return the message of `plan`.
 
-        The configuration is replaced atomically, and only while no other process writes to the
+        The configuration is written atomically, and only while no other process writes to the
         directory.
         """
-        config = self.path / CONFIG
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            if config.exists():
-                return self._grow(config)
-            if not all(map(_is_own, self.path.iterdir())):
+            if not holds_study(self.path) and not all(map(_is_own, self.path.iterdir())):
                 raise UserError(
                     f"--out {self.path} is not empty and holds no study; choose another directory"
                 )
-            study = self.contents.to_dict()
-            _write_config(config, {"format": FORMAT, "study": study, "made_with": _made_with()})
+            for last in (*[False] * _PATIENCE, True):
+                news = self.plan()
+                if holds_study(self.path) and not self._lacks_something():
+                    return news
+                try:
+                    with writer(self.path, None):
+                        return self._write()
+                except UserError:
+                    # Another shard of the same command may be doing the same at this moment.
+                    if last:
+                        raise
+                    time.sleep(_PATIENCE_SECONDS)
         except OSError as error:
             raise UserError(f"--out {self.path} cannot be written: {error.strerror}") from error
-        return ""
-
-    def _grow(self, config: Path) -> str:
-        for last in (*[False] * _PATIENCE, True):
-            news = self.plan()
-            if not Contents.read(config).lacks(self._asked):
-                return news
-            try:
-                with writer(self.path, None):
-                    news, content = self.plan(), read_config(config)
-                    change = {"added": additions_text(Contents.read(config), self.contents)}
-                    if change["added"]:
-                        made = {**change, "made_with": _made_with()}
-                        content["grown"] = [*content.get("grown", []), made]
-                        content["study"] = self.contents.to_dict()
-                        _write_config(config, content)
-                    return news
-            except UserError:
-                # Another shard of the same command may be extending the study at this moment.
-                if last:
-                    raise
-                time.sleep(_PATIENCE_SECONDS)
         raise AssertionError("the last attempt returns or raises")
+
+    def _lacks_something(self) -> bool:
+        return Contents.read(self.path / CONFIG).lacks(self._asked)
+
+    def _write(self) -> str:
+        """Write the configuration, or the additions to it; return the message of `plan`."""
+        config, news = self.path / CONFIG, self.plan()
+        if not config.exists():
+            study = self.contents.to_dict()
+            _write_config(config, {"format": FORMAT, "study": study, "made_with": _made_with()})
+            return news
+        content = read_config(config)
+        if added := additions_text(Contents.read(config), self.contents):
+            content["grown"] = [
+                *content.get("grown", []),
+                {"added": added, "made_with": _made_with()},
+            ]
+            content["study"] = self.contents.to_dict()
+            _write_config(config, content)
+        return news
 
     def refresh(self) -> bool:
         """Read additions of another process; return whether there are any."""

@@ -16,6 +16,7 @@ from pathlib import Path
 import pandas as pd
 
 from rtd3jax.errors import UserError
+from rtd3jax.evaluation.rollout import check_counts
 from rtd3jax.policies.trained import Policy
 from rtd3jax.study.ceilings import ceilings_of
 from rtd3jax.study.execute import Work, train_here
@@ -28,7 +29,7 @@ from rtd3jax.study.plan import Cell
 from rtd3jax.study.references import references_of
 from rtd3jax.study.report.page import write_page
 from rtd3jax.study.results import CURVES, EPISODES, METRICS, read_table
-from rtd3jax.study.rundir import CONFIG, RunDirectory
+from rtd3jax.study.rundir import RunDirectory, holds_study
 from rtd3jax.study.status import ledger
 from rtd3jax.system.files import user_path
 from rtd3jax.training.lanes import workers
@@ -46,8 +47,8 @@ class Study:
         final_episodes: number of episodes of the evaluation at the end of a lane.
 
     Raises:
-        UserError: when tables cannot distinguish two cells, when an existing lane of ``out`` would
-            change, or when ``out`` cannot be written.
+        UserError: when a cell cannot be trained, when tables cannot distinguish two cells, when an
+            existing lane of ``out`` would change, or when ``out`` cannot be written.
     """
 
     def __init__(
@@ -58,12 +59,13 @@ class Study:
         out: str | os.PathLike,
         final_episodes: int = 20,
     ) -> None:
+        check_counts(final_episodes, 0, "final_episodes")
         directory = RunDirectory(
-            user_path(out), _distinct(cells), check_seeds(seeds), final_episodes, prepare=False
+            user_path(out), _distinct(cells), check_seeds(seeds), int(final_episodes), prepare=False
         )
-        if (directory.path / CONFIG).exists():
-            directory.plan()  # opening a study does not extend it
-        else:
+        directory.plan()
+        if not holds_study(directory.path):  # opening a study does not extend it
+            directory.jobs(check_strategy(None))  # raises UserError before any file is written
             directory.prepare()
         self._directory = directory
 
@@ -99,12 +101,14 @@ class Study:
         """
         directory, strategy = self._directory, check_strategy(strategy)
         check_loggers(log)
+        directory.plan()
+        jobs = directory.jobs(strategy)  # raises UserError before any file is written
         if news := directory.prepare():
             print(news)
         complaints: list[str] = []
         with writer(directory.path, None):
-            directory.refresh()
-            jobs = directory.jobs(strategy)
+            if directory.refresh():  # another process has changed the study in the meantime
+                jobs = directory.jobs(strategy)
             at_once = lanes_at_once(jobs, strategy, len(workers()), usable_memory())
             interval = (checkpoint_seconds, None)
             work = Work(strategy, at_once, interval, quiet=quiet, page=page, keep=keep_checkpoints)

@@ -61,3 +61,36 @@ def test_cells_that_tables_could_not_tell_apart_are_refused(tmp_path):
     with pytest.raises(rtd.UserError, match="consists of rtd.Cell, not str"):
         rtd.Study(["rover"], out=tmp_path / "study")
     assert not (tmp_path / "study").exists()
+
+
+@pytest.mark.parametrize(
+    ("cell", "options", "message"),
+    [
+        (("rovr", "ar1-slip"), {}, "unknown environment 'rovr'"),
+        (("rover", "ar2-slip"), {}, "unknown disturbance 'ar2-slip'"),
+        (("rover", "ar1-slip"), {"final_episodes": 2.5}, "final_episodes must be an integer"),
+        (("rover", "ar1-slip"), {"final_episodes": 0}, "final_episodes must be an integer"),
+        (("rover", "ar1-slip"), {"final_episodes": "20"}, "final_episodes must be an integer"),
+    ],
+)
+def test_a_study_that_cannot_run_writes_nothing(cell, options, message, tmp_path):
+    with pytest.raises(rtd.UserError, match=message):
+        rtd.Study([rtd.Cell(*cell, rtd.Config("td3"))], out=tmp_path / "study", **options)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_cell_that_cannot_run_is_not_added(tmp_path):
+    rtd.Study(_cells(), seeds=[0], out=tmp_path / "study")
+    before = (tmp_path / "study" / "config.json").read_bytes()
+    wrong = rtd.Cell("rovr", "none", rtd.Config("td3"))
+    with pytest.raises(rtd.UserError, match="unknown environment 'rovr'"):
+        rtd.Study([*_cells(), wrong], seeds=[0], out=tmp_path / "study").run(quiet=True)
+    assert (tmp_path / "study" / "config.json").read_bytes() == before
+
+
+def test_cells_whose_files_would_have_one_name_are_refused(tmp_path):
+    joined, foreign = (("a_b", "c"), ("a", "b_c")), (("rover", "風"), ("rover", "砂"))
+    for pair in (joined, foreign):
+        with pytest.raises(rtd.UserError, match="would have the same name"):
+            rtd.Study([rtd.Cell(*two, rtd.Config("td3")) for two in pair], out=tmp_path / "study")
+    assert not list(tmp_path.iterdir())
