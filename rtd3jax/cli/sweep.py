@@ -56,6 +56,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     before = _on_termination(_terminate)
     try:
         return exit_status(lambda: _start(options, arguments), lambda: sweep_options.out(options))
+    except KeyboardInterrupt as interrupt:  # not during the training, after which results follow
+        print("interrupted: repeat the command", file=sys.stderr)
+        return _status_of(interrupt)
     finally:
         _on_termination(before)
 
@@ -75,6 +78,10 @@ class _Terminated(KeyboardInterrupt):
 
 def _terminate(*_: object) -> None:
     raise _Terminated
+
+
+def _status_of(interrupt: KeyboardInterrupt) -> int:
+    return 143 if isinstance(interrupt, _Terminated) else 130
 
 
 def _on_termination(handler: Any) -> Any:
@@ -182,7 +189,7 @@ def _train(
         try:
             train(directory, jobs, work, complaints, references, logger)
         except KeyboardInterrupt as interrupt:
-            interrupted = 143 if isinstance(interrupt, _Terminated) else 130
+            interrupted = _status_of(interrupt)
     finish(directory, references, page=options.report, interrupted=bool(interrupted))
     print((directory.path / "summary.md").read_text("utf-8"))
     print(f"results: {directory.path}")
