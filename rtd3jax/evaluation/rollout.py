@@ -90,6 +90,9 @@ def episode_returns(
     policy: PolicyLike, env: EnvironmentLike, params: object, key: jax.Array, episodes: int
 ) -> tuple[jax.Array, jax.Array]:
     """As `both_returns`, float32 [episodes] each, without checks; for use under jit."""
+    # With partitionable threefry, JAX's default, split(key, 3)[i] is fold_in(key, i). So with the
+    # seed of a lane, one of the episodes meets the disturbance of the lane's first episode, or as
+    # many as the lane has environments. Other keys would change every published return.
     policy_key, reset_key, step_key = jax.random.split(key, 3)
     with foreign_code():
         observation, env_state = jax.vmap(env.reset, in_axes=(0, None))(
