@@ -129,10 +129,13 @@ def test_the_prediction_of_a_pull_is_that_of_the_rover_on_soil():
         pytest.param("many_environments", marks=pytest.mark.slow),
         pytest.param("fine_tuning", marks=pytest.mark.slow),
         pytest.param("rover_soil_gains", marks=pytest.mark.slow),
+        pytest.param("one_step_episodes", marks=pytest.mark.slow),
+        pytest.param("benchmarks/gates", marks=pytest.mark.slow),
     ],
 )
 def test_small_experiments_run(name, tmp_path):
     load(EXPERIMENTS / f"{name}.py").main(["--quick", "--out", str(tmp_path)])
+    name = name.rpartition("/")[2]
     assert (tmp_path / f"{name}.md").exists() and (tmp_path / f"{name}.parquet").exists()
 
 

@@ -163,9 +163,8 @@ def _project(input_kernel: jax.Array, bias: jax.Array, inputs: jax.Array) -> jax
 def _activate(gates: jax.Array, exists: jax.Array):
     """The activations i, f, g and o, [B, H] each, of the sums [B, 4H]; the candidate g is masked.
 
-    A single tanh computes all four, because ``sigmoid(x) = tanh(x/2)/2 + 1/2``. A barrier follows:
-    XLA's CPU backend does not vectorise a tanh that is fused with slices, which then takes five
-    times as long.
+    A single tanh computes all four, because ``sigmoid(x) = tanh(x/2)/2 + 1/2``. The barrier keeps
+    XLA from fusing it with the slices (experiments/benchmarks/gates.py measures what this changes).
     """
     width = gates.shape[-1] // 4
     half, one = jnp.full((width,), 0.5, gates.dtype), jnp.ones((width,), gates.dtype)
