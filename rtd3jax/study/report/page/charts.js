@@ -30,6 +30,7 @@ function limits(values, references) {
 }
 
 const DASHES = { random: '2 3', constant: '8 4', ceiling: null };
+const OTHER_DASHES = ['9 3 2 3', '5 3', '9 3 2 3 2 3', '14 4'];
 
 function referencesOf(environment, measure) {
   const found = environment.references.map((r) => ({ name: r.name, value: r[measure] }));
@@ -39,7 +40,15 @@ function referencesOf(environment, measure) {
   }
   return found.filter((r) => finite(r.value));
 }
-const dashOf = (reference) => (reference.ceiling ? DASHES.ceiling : DASHES[reference.name]);
+
+// Only a ceiling is a solid line; policies that DASHES does not name get patterns in their order.
+function dashOf(reference) {
+  if (reference.ceiling) return DASHES.ceiling;
+  if (reference.name in DASHES) return DASHES[reference.name];
+  const names = DATA.environments.flatMap((environment) => environment.references.map((r) => r.name));
+  const others = [...new Set(names)].filter((name) => !(name in DASHES));
+  return OTHER_DASHES[others.indexOf(reference.name) % OTHER_DASHES.length];
+}
 
 // A value outside the axis is large, so the decimals of the axis are not needed.
 function farWords(reference, decimals) {
