@@ -95,9 +95,15 @@ def test_a_lane_acts_by_the_policy_while_parts_stay_and_the_actor_waits(env, kep
         layer: _same(policy.actor[layer], later.learner.actor[layer]) for layer in policy.actor
     }
     assert actor == {"current": False, "head": True, "output": False}
-    before, after = state.learner.critics[1], later.learner.critics[1]
-    critic = {layer: _same(before[layer], after[layer]) for layer in before}
-    assert critic == {"current": True, "head": False, "output": False}
+    before, after = state.learner, later.learner
+    for old, new in (
+        (before.critics[1], after.critics[1]),
+        (before.target_critics[1], after.target_critics[1]),
+    ):
+        critic = {layer: _same(old[layer], new[layer]) for layer in old}
+        assert critic == {"current": True, "head": False, "output": False}
+    targets = before.target_actor, after.target_actor
+    assert {layer: _same(targets[0][layer], targets[1][layer]) for layer in actor} == actor
 
 
 def test_a_whole_network_may_be_frozen():

@@ -13,6 +13,7 @@ import optax
 from flax import struct
 from jax import lax
 
+from rtd3jax.agents.freeze import frozen_parts
 from rtd3jax.agents.history import History
 from rtd3jax.agents.hyperparameters import Hyperparameters
 from rtd3jax.agents.learners.base import Measured, Metrics, Networks, measured, not_measured
@@ -54,9 +55,13 @@ class TD3:
 
     Attributes:
         policy_delay: critic updates per update of the actor and the targets.
+        frozen: parts of the networks that keep their values, as in `frozen_parts`. They are put
+            back before the targets are averaged, which would otherwise follow steps of Adam that
+            the networks never keep.
     """
 
     policy_delay: int = 2
+    frozen: tuple[str, ...] = ()
 
     metrics = (
         "critic_loss",
@@ -99,11 +104,12 @@ class TD3:
     ) -> tuple[TD3State, Metrics]:
         """Update the critics, and every ``policy_delay``-th time the actor and the targets."""
         norms = count % NORMS_EVERY == 0
-        state, critic = update_critics(networks, state, batch, keys[0], hyperparameters, norms)
+        new, critic = update_critics(networks, state, batch, keys[0], hyperparameters, norms)
+        state = frozen_parts(state, new, self.frozen)
         state, actor = lax.cond(
             count % self.policy_delay == 0,
             lambda before: update_actor_and_targets(
-                networks, before, batch, keys[1], hyperparameters, norms
+                networks, before, batch, keys[1], hyperparameters, norms, self.frozen
             ),
             lambda before: (before, {name: not_measured() for name in ACTOR_METRICS}),
             state,
@@ -113,7 +119,7 @@ class TD3:
 
 def make_td3(config: Config) -> TD3:
     """The learner of a configuration."""
-    return TD3(config.policy_delay)
+    return TD3(config.policy_delay, config.frozen)
 
 
 def target(
@@ -222,8 +228,9 @@ def update_actor_and_targets(
     key: jax.Array,
     hyperparameters: Hyperparameters,
     norms: jax.Array,
+    frozen: tuple[str, ...] = (),
 ) -> tuple[TD3State, Metrics]:
-    """One Adam step of the actor, then Polyak averaging of all targets."""
+    """One Adam step of the actor, without its ``frozen`` parts; then Polyak averaging."""
     (loss, saturated), gradient = jax.value_and_grad(actor_loss, has_aux=True)(
         state.actor, state.critics[0], networks, batch, key, hyperparameters.actor_noise
     )
@@ -231,6 +238,7 @@ def update_actor_and_targets(
         state.actor, gradient, state.actor_optimizer, hyperparameters.actor_learning_rate
     )
     tau, before = hyperparameters.tau, state.actor_optimizer.mu
+    actor = frozen_parts(state, dataclasses.replace(state, actor=actor), frozen).actor
 
     def average(online, target):
         return jax.tree.map(lambda new, old: old + tau * (new - old), online, target)
