@@ -122,6 +122,11 @@ class Agent:
         """Statistics of zero observations; None without normalisation of observations."""
         return no_statistics(self.observation_size) if self.config.normalise_observations else None
 
+    def no_true_statistics(self) -> Statistics | None:
+        """As `no_statistics`, of undisturbed observations; None if the critics do not read them."""
+        wanted = self.config.normalise_observations and self.reads_truth
+        return no_statistics(self.true_observation_size) if wanted else None
+
     def act(
         self, actor: Params, window: Window, running: Carry | None
     ) -> tuple[jax.Array, Carry | None]:
@@ -171,13 +176,14 @@ class Agent:
         count: jax.Array,
         history_length: jax.Array,
         normaliser: Normaliser | None,
+        of_truth: Normaliser | None = None,
     ) -> Batch:
         """A batch from the ``count`` steps written so far, with normalised observations."""
         batch = self._sample(replay, key, count, history_length)
         return dataclasses.replace(
             batch,
-            window=normalised(batch.window, normaliser),
-            next_window=normalised(batch.next_window, normaliser),
+            window=normalised(batch.window, normaliser, of_truth),
+            next_window=normalised(batch.next_window, normaliser, of_truth),
         )
 
     def _sample(

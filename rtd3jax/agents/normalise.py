@@ -86,19 +86,32 @@ def as_read(observation: jax.Array, normaliser: Normaliser | None) -> jax.Array:
 
 
 @overload
-def normalised(history: Window, normaliser: Normaliser | None) -> Window: ...
+def normalised(
+    history: Window, normaliser: Normaliser | None, of_truth: Normaliser | None = None
+) -> Window: ...
 
 
 @overload
-def normalised(history: History, normaliser: Normaliser | None) -> History: ...
+def normalised(
+    history: History, normaliser: Normaliser | None, of_truth: Normaliser | None = None
+) -> History: ...
 
 
-def normalised(history: History, normaliser: Normaliser | None) -> History:
-    """``history`` with all observations normalised, unless ``normaliser`` is None."""
+def normalised(
+    history: History, normaliser: Normaliser | None, of_truth: Normaliser | None = None
+) -> History:
+    """``history`` with all observations normalised, unless ``normaliser`` is None.
+
+    ``of_truth`` normalises the undisturbed observations, which have statistics of their own: a
+    disturbance may hide an element, whose deviation would then be unknown.
+    """
 
     def of(steps: Steps) -> Steps:
         return dataclasses.replace(steps, observation=as_read(steps.observation, normaliser))
 
+    if history.true_observation is not None:
+        true = as_read(history.true_observation, of_truth)
+        history = dataclasses.replace(history, true_observation=true)
     observation = as_read(history.observation, normaliser)
     if isinstance(history, Window):
         return dataclasses.replace(history, past=of(history.past), observation=observation)

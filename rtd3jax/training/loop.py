@@ -17,7 +17,7 @@ from jax.typing import ArrayLike
 
 from rtd3jax.agents.agent import Agent, make_agent
 from rtd3jax.agents.bounds import Bounds
-from rtd3jax.agents.history import Steps
+from rtd3jax.agents.history import Steps, Window
 from rtd3jax.agents.hyperparameters import Hyperparameters
 from rtd3jax.agents.memory.base import Carry
 from rtd3jax.agents.noise import add_noise
@@ -75,6 +75,7 @@ class LaneState:
         learner: the learner's state: networks and optimisers.
         replay: the replay of transitions.
         statistics: statistics of the observations, if networks read them normalised; else None.
+        true_statistics: the same of the undisturbed observations, if critics read them.
         env_state: the state of the environment; with a leading axis for several environments.
         observation: [E, O], the current observations.
         previous_action: [E, A], in half ranges; zero at the start of an episode.
@@ -100,6 +101,7 @@ class LaneState:
     metrics: Averages
     failure: jax.Array
     failed_at: jax.Array
+    true_statistics: Statistics | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -164,6 +166,7 @@ class Program:
             metrics=empty_averages(self.agent.metrics, self.evaluations, count),
             failure=jnp.int32(HEALTHY),
             failed_at=jnp.int32(-1),
+            true_statistics=self.agent.no_true_statistics(),
         )
 
     def advance(self, lane: Lane, state: LaneState, start: jax.Array, stop: jax.Array) -> LaneState:
@@ -207,24 +210,19 @@ class Program:
         statistics = state.statistics
         if statistics is not None:
             statistics = statistics.note(state.observation)
+        true_statistics = state.true_statistics
+        if true_statistics is not None:
+            true_statistics = true_statistics.note(self._truth(state.env_state, lane))
         normaliser = _normaliser(statistics)
-        present = present_window(
-            state.replay,
-            step,
-            state.episode_step,
-            state.observation,
-            state.previous_action,
-            self.agent.acting_tokens,
-            hyperparameters.history_length,
-        )
-        window = normalised(present, normaliser)
+        window = self._window(lane, state, step, normaliser)
         greedy, kept = self.agent.act(state.learner.actor, window, state.carry)
         action = self._explore(greedy, act_key, hyperparameters, step)
         carry = self.agent.carry_after(state.learner.actor, window, action, state.carry)
         replay = keep_acting_carry(state.replay, step, state.episode_step, kept)
 
+        normalisers = normaliser, _normaliser(true_statistics)
         learner, metrics, loss = self._learn(
-            state.learner, replay, normaliser, state.metrics, learn_key, hyperparameters, step
+            state.learner, replay, normalisers, state.metrics, learn_key, hyperparameters, step
         )
 
         observation, env_state, reward, terminated, truncated, info = self._transit(
@@ -266,6 +264,7 @@ class Program:
             learner=learner,
             replay=replay,
             statistics=statistics,
+            true_statistics=true_statistics,
             env_state=env_state,
             observation=observation.astype(jnp.float32),
             previous_action=jnp.where(done[:, None], 0.0, action),
@@ -279,6 +278,31 @@ class Program:
         state = _note_failure(state, at, ~finite, ENVIRONMENT_NOT_FINITE)
         state = _note_failure(state, at, ~jnp.isfinite(loss), LOSS_NOT_FINITE)
         return self._evaluate(lane, state, (step + 1) * self.config.environments)
+
+    def _window(
+        self, lane: Lane, state: LaneState, step: jax.Array, normaliser: Normaliser | None
+    ) -> Window:
+        """What the actor reads at the ``step`` of all environments."""
+        present = present_window(
+            state.replay,
+            step,
+            state.episode_step,
+            state.observation,
+            state.previous_action,
+            self.agent.acting_tokens,
+            lane.hyperparameters.history_length,
+        )
+        return normalised(present, normaliser)
+
+    def cut(self, lane: Lane, state: LaneState, step: jax.Array) -> LaneState:
+        """The state whose episodes end before ``step``: the replay has the carries at their end.
+
+        Without an end, `store` leaves this to the next step, which here begins other episodes.
+        """
+        window = self._window(lane, state, step, _normaliser(state.statistics))
+        _, kept = self.agent.act(state.learner.actor, window, state.carry)
+        replay = keep_acting_carry(state.replay, step, state.episode_step, kept)
+        return dataclasses.replace(state, replay=replay)
 
     def _reset(self, key: jax.Array, lane: Lane) -> tuple[jax.Array, Any]:
         """The first observations [E, O] of the environments, and their state."""
@@ -342,13 +366,16 @@ class Program:
         self,
         learner: Any,
         replay: Replay,
-        normaliser: Normaliser | None,
+        normalisers: tuple[Normaliser | None, Normaliser | None],
         metrics: Averages,
         key: jax.Array,
         hyperparameters: Hyperparameters,
         step: jax.Array,
     ) -> tuple[Any, Averages, jax.Array]:
-        """The updates of the step, if any, and the critics' loss [], 0 without updates."""
+        """The updates of the step, if any, and the critics' loss [], 0 without updates.
+
+        ``normalisers`` are those of observations and of undisturbed observations.
+        """
         config = self.config
         count = step * config.environments
         hyperparameters = hyperparameters.decayed(count.astype(jnp.float32) / config.total_steps)
@@ -360,7 +387,7 @@ class Program:
             learner: Any, metrics: Averages, keys: jax.Array, number: jax.Array
         ) -> tuple[Any, Averages, jax.Array]:
             history_length = hyperparameters.history_length
-            batch = self.agent.sample(replay, keys[0], count, history_length, normaliser)
+            batch = self.agent.sample(replay, keys[0], count, history_length, *normalisers)
             learner, found = self.agent.update(learner, batch, keys[1:], hyperparameters, number)
             return learner, note_update(metrics, found), found["critic_loss"].total
 
@@ -426,6 +453,7 @@ def revived(program: Program, lane: Lane, state: LaneState, step: int) -> LaneSt
     root = jax.random.key(lane.seed)
     key = jax.random.fold_in(jax.random.fold_in(root, _REVIVED), step)
     observation, env_state = program._reset(key, lane)
+    state = jax.jit(program.cut)(lane, state, jnp.int32(step // program.config.environments))
     return dataclasses.replace(
         state,
         env_state=env_state,

@@ -27,7 +27,7 @@ from rtd3jax.training.loop import HEALTHY, Lane, LaneState, Program
 KNOWN_OBSERVATIONS = 1_000
 """What a policy's statistics weigh, in observations, against those that the new lane will see."""
 
-_TAKEN = "learner", "statistics"
+_TAKEN = "learner", "statistics", "true_statistics"
 """Of a lane's checkpoint: the parts of a `LaneState` that training goes on from."""
 _FATE = ".failure", ".failed_at"
 

@@ -55,6 +55,21 @@ def test_under_a_disturbance_the_replay_holds_what_the_sensors_hide():
     np.testing.assert_allclose(change, 0.05 * after[:, 2], atol=1e-4)
 
 
+def test_the_truth_is_normalised_by_statistics_of_its_own():
+    """The hidden element too, which the observation does not have."""
+    job, state = _advanced(rtd.make("pendulum", "hidden"), normalise_observations=True)
+    truth = np.asarray(state.replay.transitions.truth.observation)[:STEPS]
+    np.testing.assert_allclose(state.true_statistics.mean, truth.mean(0), rtol=1e-4, atol=1e-5)
+    normalisers = state.statistics.normaliser(), state.true_statistics.normaliser()
+    length = jnp.int32(job.program.window_tokens)
+    key, count = jax.random.key(0), jnp.int32(STEPS)
+    raw = job.program.agent.sample(state.replay, key, count, length, None)
+    read = job.program.agent.sample(state.replay, key, count, length, *normalisers)
+    want = (np.asarray(raw.window.true_observation) - truth.mean(0)) / truth.std(0)
+    np.testing.assert_allclose(read.window.true_observation, want, rtol=1e-3, atol=1e-3)
+    assert read.next_window.true_observation.shape == want.shape
+
+
 @pytest.mark.parametrize("replay", ["segments", pytest.param("windows", marks=pytest.mark.slow)])
 def test_the_target_depends_on_the_truth_and_the_action_does_not(replay):
     more = {"segment_length": 2} if replay == "segments" else {}

@@ -118,6 +118,19 @@ def test_stored_carries_are_the_actors_own(lane):
             np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-6)
 
 
+def test_the_newest_row_has_its_next_carry_when_its_episode_is_cut(lane):
+    """As at the restart of a simulator, where no next step of this episode stores it."""
+    program, one, state = lane
+    assert int(state.episode_step[0]) > 0
+    number, length = jnp.array([STEPS - 1], jnp.int32), program.window_tokens
+    cut = jax.jit(program.cut)(one, state, jnp.int32(STEPS))
+    batch = gather(cut.replay, number, jnp.int32(STEPS), length, length)
+    want = carry_before(program.agent.acting, state.learner.actor, batch.next_window)
+    for got, own in zip(batch.next_carry, want, strict=True):
+        assert np.any(own)
+        np.testing.assert_allclose(got, own, rtol=1e-6, atol=1e-6)
+
+
 @pytest.mark.parametrize("burn_in_gradient", [True, False])
 def test_segments_go_on_from_the_carry_that_was_stored(lane, burn_in_gradient):
     """While the actor stays the same, a short burn-in from there is as good as a whole episode."""
