@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from typing import Any, Generic, TypeVar
 
 from rtd3jax.errors import UserError, nearest
+from rtd3jax.system.program_cache import forget_programs
 
 Entry = TypeVar("Entry")
 
@@ -36,7 +37,10 @@ class Registry(Generic[Entry]):
                 f"{self._kind} {name!r} is already registered; choose another name, "
                 "or pass replace=True"
             )
+        replaced = self._entries.get(name, entry) is not entry
         self._entries[name] = entry
+        if replaced:  # programs are found by the name of what they were made of
+            forget_programs()
 
     def check(self, name: object) -> None:
         """Raise UserError unless there is an entry of this name."""

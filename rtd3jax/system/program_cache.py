@@ -52,10 +52,15 @@ def make_room() -> bool:
         used, limit = _mappings()
         if used <= _SHARE * limit:
             return False
-        for empty in _caches:
-            empty()
-        jax.clear_caches()
+        forget_programs()
         return True
+
+
+def forget_programs() -> None:
+    """Remove all programs, also if there is room."""
+    for empty in _caches:
+        empty()
+    jax.clear_caches()
 
 
 def _mappings() -> tuple[int, float]:

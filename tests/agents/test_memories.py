@@ -162,3 +162,18 @@ def test_names_are_taken_once_and_modules_are_memories():
         rtd.register_memory("two words", _Lag)
     with pytest.raises(rtd.UserError, match="memory 'lsmt' is unknown; did you mean 'lstm'"):
         rtd.Config(memory="lsmt")
+
+
+def test_a_memory_that_replaces_another_takes_effect_at_once():
+    class Doubled(MEMORIES["gru"]):
+        def read(self, carry):
+            return 2.0 * super().read(carry)
+
+    fields = dict(history_length=1, total_steps=40, hidden_size=4, batch_size=4, learning_starts=10)
+    env = rtd.make("rover", "ar1-slip")
+    returns = []
+    for module in (MEMORIES["gru"], Doubled):
+        rtd.register_memory("own", module, replace=True)
+        config = rtd.Config("lstm-td3", memory="own", eval_every=20, eval_episodes=1, **fields)
+        returns.append(rtd.train(env, config, [0], progress=False).returns)
+    assert not np.array_equal(*returns)
