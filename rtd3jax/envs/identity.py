@@ -1,10 +1,13 @@
 """Equality of environments by value, and strongly typed states, for compiled programs."""
 
+import dataclasses
 import functools
+from collections.abc import Iterator
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 
 
@@ -60,6 +63,42 @@ class ValueIdentity:
         """Start an episode; None for ``params`` means ``default_params``."""
         params = self.default_params if params is None else params  # type: ignore[attr-defined]
         return super().reset(key, params)  # type: ignore[misc]
+
+
+_WORDS = (str, bool, int, float)
+
+
+def in_words(thing: object) -> str:
+    """What distinguishes environments or parameters beside numbers, equal in every process.
+
+    These are the types, an environment's static options, and the static fields of parameters.
+    """
+    name = type(thing).__qualname__
+    if isinstance(thing, ValueIdentity):
+        return f"{name}({', '.join(map(in_words, thing.identity()))})"
+    if isinstance(thing, tuple | list):
+        return f"({', '.join(map(in_words, thing))})"
+    if isinstance(thing, dict):
+        return f"({', '.join(f'{key}={in_words(value)}' for key, value in thing.items())})"
+    if thing is None or isinstance(thing, _WORDS):
+        return repr(thing)
+    if isinstance(thing, np.ndarray | jax.Array):
+        return "*"
+    if dataclasses.is_dataclass(thing):
+        return f"{name}({', '.join(_fields(thing))})"
+    if callable(thing) and hasattr(thing, "__qualname__"):
+        return str(thing.__qualname__)
+    own = {k: v for k, v in getattr(thing, "__dict__", {}).items() if isinstance(v, _WORDS)}
+    return f"{name}({', '.join(f'{key}={own[key]!r}' for key in sorted(own))})"
+
+
+def _fields(thing: Any) -> Iterator[str]:
+    """The fields of a dataclass in words, without those that are numbers of the plant."""
+    for field in dataclasses.fields(thing):
+        value = getattr(thing, field.name)
+        static = field.metadata.get("pytree_node") is False
+        if static or not isinstance(value, int | float | np.ndarray | jax.Array):
+            yield f"{field.name}={in_words(value)}"
 
 
 @functools.cache

@@ -36,6 +36,9 @@ took. With five lanes on two cores, checkpoints then take at most 2% of the time
 MOST_NUMBERS = 1_000
 """Numbers of an array that the identity of a checkpoint contains; of a longer one, a digest."""
 
+PLANT = "plant"
+"""Part of an identity that earlier checkpoints do not have."""
+
 KEPT = 2
 LONGER = ("total_steps", "replay_capacity")
 """Fields of the configuration that may increase when a lane continues from its checkpoint."""
@@ -180,6 +183,8 @@ class Checkpoints:
             "versions": versions(),
         }
         there = metadata if isinstance(metadata, dict) else {}
+        if PLANT not in (there.get("identity") or {}):
+            here["identity"] = {n: x for n, x in here["identity"].items() if n != PLANT}
         longer = is_longer(there.get("identity"), here["identity"])
         if longer:
             reason = why_not_longer(there["identity"], here["identity"], int(there["step"]))

@@ -14,13 +14,14 @@ from rtd3jax.envs.compat.simulated import is_simulated, simulated_identity
 from rtd3jax.envs.compat.simulator import fault_of
 from rtd3jax.envs.compat.simulator_state import simulator_state
 from rtd3jax.envs.entry import parameters_of
+from rtd3jax.envs.identity import in_words
 from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
 from rtd3jax.policies.trained import Policy
 from rtd3jax.protocols import EnvironmentLike
 from rtd3jax.system.files import user_path
 from rtd3jax.system.switches import check_compiling
-from rtd3jax.training.checkpoint import Checkpoints, named_numbers
+from rtd3jax.training.checkpoint import PLANT, Checkpoints, named_numbers
 from rtd3jax.training.feasibility import check_segments, warn_if_untrained
 from rtd3jax.training.lanes import (
     Group,
@@ -226,14 +227,18 @@ def _checkpoints(
     seconds: float | None,
 ) -> Checkpoints:
     environment = {"env": str(getattr(env, "name", type(env).__name__)), "params": None}
+    # Static options are not among the parameters, such as the channel of a disturbance.
+    plant = in_words(env)
     if is_simulated(env):  # the observed elements, and the arguments of its construction
         environment["env"] = simulated_identity(env)
+        plant = getattr(env, "reward_from", "")
 
     def identity(job: Job) -> dict[str, Any]:
         index, seed = job.key
         params = [named_numbers(leaf) for leaf in jax.tree.leaves(job.lane.env_params)]
         own = {"start": job.start.where} if job.start is not None else {}
-        return {**configs[index].to_dict(), **own, **environment, "params": params, "seed": seed}
+        about = {"params": params, PLANT: f"{plant} with {in_words(job.lane.env_params)}"}
+        return {**configs[index].to_dict(), **own, **environment, **about, "seed": seed}
 
     return Checkpoints(lambda job: directories[job.cell] / f"seed-{job.seed}", identity, seconds)
 
@@ -359,7 +364,11 @@ def check_seeds(seeds: Iterable[int]) -> tuple[int, ...]:
     """Distinct integers in 0..2**32-1, at least one."""
     seeds = tuple(seeds)
     for seed in seeds:
-        if isinstance(seed, bool) or seed != int(seed) or not 0 <= seed < 2**32:
+        try:
+            whole = not isinstance(seed, bool) and seed == int(seed)
+        except (TypeError, ValueError, OverflowError):
+            whole = False
+        if not whole or not 0 <= seed < 2**32:
             raise UserError(f"seeds must be integers from 0 to 2**32 - 1, not {seed!r}")
     if not seeds or len(set(seeds)) < len(seeds):
         raise UserError(f"seeds must be distinct and at least one, not {list(seeds)}")

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import rtd3jax as rtd
+from rtd3jax.system.files import read_arrays, write_arrays
 from rtd3jax.training import lanes, run
 from rtd3jax.training.checkpoint import Checkpoints
 
@@ -167,6 +168,43 @@ def test_another_environment_or_version_is_refused(stopped, monkeypatch):
     monkeypatch.setattr(checkpoint, "versions", lambda: {**versions, "jax": "9.9"})
     with pytest.raises(rtd.UserError, match="another versions .jax: .* there, 9.9 here"):
         _train(stopped)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "difference"),
+    [
+        (
+            rtd.make("pendulum", disturbance="noise", reward_from="state"),
+            rtd.make("pendulum", disturbance="noise", reward_from="observation"),
+            "'state'.* there, .*'observation'.* here",
+        ),
+        (
+            rtd.disturb(rtd.make("pendulum"), rtd.Hidden(element=2)),
+            rtd.disturb(rtd.make("pendulum"), rtd.Hidden(element=0)),
+            "element=2.* there, .*element=0.* here",
+        ),
+    ],
+)
+def test_static_options_of_an_environment_identify_a_lane(first, second, difference, tmp_path):
+    config = dataclasses.replace(CONFIG, total_steps=30, algorithm="td3", history_length=None)
+
+    def write(env):
+        checkpoints = run._checkpoints([tmp_path], [config], env, None)
+        (job,) = run.make_jobs(env, config, [0], cell=0)
+        return checkpoints, job, job.program.init(job.lane)
+
+    checkpoints, job, state = write(first)
+    checkpoints.save([(job, state)], object(), 10)
+    assert checkpoints.restore([job]) is not None
+    checkpoints, job, _ = write(second)
+    with pytest.raises(rtd.UserError, match=f"another identity .plant: .*{difference}"):
+        checkpoints.restore([job])
+    # A checkpoint of an earlier version does not have it.
+    file = next(tmp_path.rglob("*.safetensors"))
+    arrays, metadata = read_arrays(file)
+    del metadata["identity"]["plant"]
+    write_arrays(file, arrays, metadata)
+    assert checkpoints.restore([job]) is not None
 
 
 def test_a_directory_that_cannot_be_written_is_named(tmp_path):
