@@ -234,11 +234,15 @@ class Config:
                     f"freeze: {part!r} is not actor, critics, or a layer of these, such as "
                     "actor.memory"
                 )
-        window = 1 + self.window_tokens
+        window = (1 + self.window_tokens) * self.environments
         if self.capacity < max(self.batch_size, window):
+            each = f" of each of {self.environments} environments" if self.environments > 1 else ""
+            remedy = "replay_capacity"
+            if self.replay_capacity is None:  # it follows
+                remedy = f"total_steps ({self.total_steps}), which it follows"
             raise UserError(
                 f"replay_capacity ({self.capacity}) holds less than a batch "
-                f"({self.batch_size}) or a window ({window}); raise replay_capacity"
+                f"({self.batch_size}) or a window{each} ({window}); raise {remedy}"
             )
 
     def _resolve_history_length(self) -> None:
@@ -278,6 +282,12 @@ class Config:
                 raise UserError(
                     f"segment_length={self.segment_length} needs replay='segments': with windows, "
                     "every transition has its own history"
+                )
+            if self.burn_in_gradient and self.has_window:
+                warnings.warn(
+                    "burn_in_gradient=True has no effect: windows have no burn-in; it needs "
+                    "replay='segments'",
+                    stacklevel=4,
                 )
             resolved["segment_length"] = 0
         elif self.segment_length is None and isinstance(self.batch_size, int):

@@ -25,7 +25,11 @@ from rtd3jax.cli.sweep_options import overrides, parser
         ({"hidden_size": True}, "hidden_size must be an integer"),
         ({"actor_learning_rate": "fast"}, "actor_learning_rate must be a number"),
         ({"batch_size": 2_000}, "batch_size .2000. is larger than learning_starts"),
-        ({"replay_capacity": 50}, "replay_capacity .50. holds less"),
+        ({"replay_capacity": 50}, "replay_capacity .50. holds less.*; raise replay_capacity"),
+        (
+            {"total_steps": 50},
+            "replay_capacity .50. holds less.*; raise total_steps .50., which it",
+        ),
         ({"eval_every": 2**31}, "eval_every must be below"),
     ],
 )

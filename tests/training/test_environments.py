@@ -213,6 +213,10 @@ def test_however_it_is_cut_and_whatever_stands_beside_it():
         (dict(total_steps=91), r"total_steps \(91\) is not a multiple of environments \(3\).*90"),
         (dict(eval_every=10), "eval_every .10. is not a multiple of environments"),
         (dict(replay_capacity=50), "replay_capacity .50. is not a multiple"),
+        (
+            dict(replay_capacity=12, history_length=4, batch_size=4),
+            r"replay_capacity .12. holds less than .* a window of each of 3 environments .15.;",
+        ),
         (dict(update_every=2), "update_every .2. and environments .3.: one must be a multiple"),
         (dict(environments=0), "environments must be at least 1"),
         (

@@ -52,3 +52,8 @@ def test_a_carry_beyond_the_windows_is_warned_of():
 @pytest.mark.parametrize("batch_size, length", [(100, 10), (50, 10), (8, 8), (14, 7), (13, 1)])
 def test_the_default_length_divides_the_batch(batch_size, length):
     assert rtd.Config(replay="segments", batch_size=batch_size).segment_length == length
+
+
+def test_a_gradient_of_the_burn_in_without_a_burn_in_is_a_warning():
+    with pytest.warns(UserWarning, match="burn_in_gradient=True has no effect: windows have no"):
+        rtd.Config("lstm-td3", burn_in_gradient=True)
