@@ -231,7 +231,7 @@ def test_a_second_writer_is_refused_and_a_dead_one_is_not_in_the_way(tmp_path, c
     from rtd3jax.study.lock import writer
 
     out = tmp_path / "run"
-    out.mkdir()
+    assert sweep.main([*TINY, "--out", str(out), "--shard", "2/2"]) == 0
     with writer(out, (1, 2)):
         assert sweep.main([*TINY, "--out", str(out)]) == 2
         assert "another process is writing to it" in capsys.readouterr().err
