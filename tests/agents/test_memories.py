@@ -8,6 +8,7 @@ import pytest
 import rtd3jax as rtd
 from rtd3jax.agents.memory import check_memory
 from rtd3jax.registries import MEMORIES
+from rtd3jax.training.run import make_jobs
 
 TOKENS, BATCH, WIDTH = 6, 4, 5
 BUILT_IN = ("lstm", "gru", "min-gru")
@@ -169,11 +170,11 @@ def test_a_memory_that_replaces_another_takes_effect_at_once():
         def read(self, carry):
             return 2.0 * super().read(carry)
 
-    fields = dict(history_length=1, total_steps=40, hidden_size=4, batch_size=4, learning_starts=10)
-    env = rtd.make("rover", "ar1-slip")
-    returns = []
+    env, returns = rtd.make("rover", "ar1-slip"), []
     for module in (MEMORIES["gru"], Doubled):
         rtd.register_memory("own", module, replace=True)
-        config = rtd.Config("lstm-td3", memory="own", eval_every=20, eval_episodes=1, **fields)
-        returns.append(rtd.train(env, config, [0], progress=False).returns)
+        config = rtd.Config("lstm-td3", 1, memory="own", hidden_size=4)
+        (job,) = make_jobs(env, config, [0])
+        policy = job.program.policy(job.lane, jax.jit(job.program.init)(job.lane))
+        returns.append(rtd.evaluate(policy, env, episodes=2))
     assert not np.array_equal(*returns)
