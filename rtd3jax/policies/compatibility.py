@@ -1,6 +1,8 @@
 """Checks that a policy fits an environment."""
 
+import dataclasses
 import warnings
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -47,6 +49,17 @@ def check_compatible(
             f"the policy's action has shape {given}, the environment's {action_shape}: {remedy}"
         )
     _warn_of_bounds(policy, low, high)
+
+
+def fitted(policy: PolicyLike, action_shape: tuple[int, ...]) -> Any:
+    """``policy``, whose constant action, if it is flat, gets the environment's shape."""
+    constant = getattr(policy, "action", None)
+    if not isinstance(constant, jax.Array) or constant.shape == action_shape:
+        return policy
+    if not dataclasses.is_dataclass(policy) or constant.size != int(np.prod(action_shape)):
+        return policy
+    changed: Any = policy
+    return dataclasses.replace(changed, action=constant.reshape(action_shape))
 
 
 def _action_shape(policy: PolicyLike, observation_size: int) -> tuple[int, ...] | None:

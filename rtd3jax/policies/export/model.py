@@ -144,8 +144,10 @@ def fold(
     elif cell == "min-gru":
         arrays |= {f"input_{name}": array for name, array in memory.items()}
     low, high = np.asarray(low, np.float32), np.asarray(high, np.float32)
-    arrays["action_centre"] = np.float32(0.5) * (high + low)
-    arrays["action_half_range"] = np.float32(0.5) * (high - low)
+    arrays["action_centre"] = np.float32(0.5) * high + np.float32(0.5) * low
+    arrays["action_half_range"] = np.float32(0.5) * high - np.float32(0.5) * low
+    # centre + half range may exceed the bound by a rounding error.
+    arrays["action_low"], arrays["action_high"] = low, high
     if np.any(centre_token):
         arrays["centre_token"] = centre_token
     if normaliser is not None:

@@ -118,6 +118,8 @@ def _build(graph: _Graph, model: Model) -> None:
     token = graph.add("Tanh", [graph.linear("output", head)], "action_token")
     scaled = graph.add("Mul", [token, graph.weight("action_half_range")])
     flat = graph.add("Add", [scaled, graph.weight("action_centre")])
+    flat = graph.add("Max", [flat, graph.weight("action_low")])
+    flat = graph.add("Min", [flat, graph.weight("action_high")])
     graph.add("Reshape", [flat, graph.integers(-1, *model.action_shape)], "action")
     if "centre_token" in model.arrays:
         token = graph.add("Add", [token, graph.weight("centre_token")], "shifted_action_token")

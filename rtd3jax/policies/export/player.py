@@ -38,6 +38,7 @@ class Player:
             if f"{name}_kernel" in arrays
         }
         self._centre, self._half_range = arrays["action_centre"], arrays["action_half_range"]
+        self._low, self._high = arrays["action_low"], arrays["action_high"]
         self._centre_token = arrays.get("centre_token")
         self._mean = arrays.get("observation_mean")
         if self._mean is not None:
@@ -100,6 +101,7 @@ class Player:
         kernel, bias = self._linear["output"]
         token = np.tanh(head @ kernel + bias)
         action = self._centre + self._half_range * token
+        action = np.minimum(np.maximum(action, self._low), self._high)
         if self._centre_token is not None:
             token = token + self._centre_token
         if self.metadata["memory"] and not self._with_current:

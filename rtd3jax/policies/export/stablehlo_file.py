@@ -105,6 +105,7 @@ def play(
         jnp.asarray(network.apply(variables, feature, current, method="from_features"))
     )
     action = arrays["action_centre"][None, :] + arrays["action_half_range"][None, :] * token
+    action = jnp.clip(action, arrays["action_low"][None, :], arrays["action_high"][None, :])
     if "centre_token" in arrays:
         token = token + arrays["centre_token"][None, :]
     parts["action"] = token

@@ -3,6 +3,7 @@
 All agents and forms drive side by side, 5 episodes of 200 steps each.
 """
 
+import dataclasses
 import importlib.util
 
 import jax
@@ -13,6 +14,7 @@ import pytest
 from random_policies import random_policy
 
 import rtd3jax as rtd
+from rtd3jax.agents.bounds import Bounds
 from rtd3jax.policies.export.formats import FORMATS
 
 WORLDS = {"pendulum": "random-sine", "rover": "ar1-slip"}
@@ -137,3 +139,18 @@ def test_one_onnx_and_one_stablehlo_file_serve_every_batch_size(tmp_path):
         onnx_state = dict(zip(onnx_state, after, strict=True))
         np.testing.assert_allclose(found, action, atol=1e-5)
         np.testing.assert_allclose(onnx_action, action, atol=1e-5)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_a_saturated_action_is_a_bound_exactly(form, tmp_path):
+    """In float32, 0.3 - 0.6 is less than -0.3."""
+    policy = random_policy("td3", rtd.make("pendulum"))
+    bounds = Bounds(jnp.float32([-0.3]), jnp.float32([0.9]))
+    output = {"kernel": 0.0 * policy.actor["output"]["kernel"], "bias": jnp.float32([-50.0])}
+    policy = dataclasses.replace(policy, bounds=bounds, actor={**policy.actor, "output": output})
+    path = tmp_path / ("saturated" + FORMATS[form][0])
+    policy.export(path, format=form)
+    player = PLAYERS[form](path)
+    player.reset()
+    action = np.asarray(player.step(np.zeros(3, np.float32)))
+    assert action == np.float32(-0.3) == np.asarray(policy.step(policy.init(), jnp.zeros(3))[0])
