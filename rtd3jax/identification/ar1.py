@@ -51,12 +51,14 @@ def fit_ar1(parts: Sequence[np.ndarray], max_slip: float | None = None) -> Fit:
     sigma = math.exp(log_sigma)
     # Steps of about a tenth of a standard error: the change of the loss exceeds its rounding.
     steps = np.array([0.1 * sigma / math.sqrt(products[0]), 0.1 / math.sqrt(2.0 * x.size)])
-    covariance = np.linalg.inv(_curvature(loss, found.x, steps))
-    errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    curvature = _curvature(loss, found.x, steps)
     notes = []
     if rho in (0.0, 1.0):
-        errors[0] = math.nan
+        # The likelihood still rises beyond the bound: only sigma is at a maximum.
+        errors = np.array([math.nan, 1.0 / math.sqrt(curvature[1, 1])])
         notes.append(f"rho is at its bound {rho:g}, so it has no standard error.")
+    else:
+        errors = np.sqrt(np.maximum(np.diag(np.linalg.inv(curvature)), 0.0))
     share = float(np.mean(~inside))
     if share > 0.0:
         notes.append(

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rtd3jax.envs.processes.process import Process
+from rtd3jax.envs.rover.slip import WHEELS, Ar1Slip, SineSlip
 from rtd3jax.errors import UserError, first_line
 from rtd3jax.evaluation.style import STYLE
 from rtd3jax.system.files import check_target, write_new
@@ -21,7 +22,9 @@ MOST_ROWS = 1_000
 
 
 def played(process: Process, steps: int, size: int, episodes: int, seed: int) -> np.ndarray:
-    """Simulated offsets or slips of a process: [episodes, steps, size]."""
+    """Simulated offsets [episodes, steps, size] of a process, or slips [episodes, steps, 2]."""
+    if isinstance(process, Ar1Slip | SineSlip):
+        size = WHEELS  # whatever the log holds: its elements are equal in distribution
     ones = jnp.ones((size,), jnp.float32)
     still = jnp.zeros((size,), jnp.float32)
 

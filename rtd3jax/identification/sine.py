@@ -33,8 +33,8 @@ def fit_sine(parts: Sequence[np.ndarray], max_slip: float | None = None) -> Fit:
     what they leave unexplained.
     """
     slip, bound, _ = bounded_slip("sine", parts, max_slip)
-    waves = [part[:, k] for part in slip for k in range(part.shape[1])]
-    waves = [wave for wave in waves if len(wave) >= SHORTEST and np.ptp(wave) > 0.0]
+    every = [part[:, k] for part in slip for k in range(part.shape[1])]
+    waves = [wave for wave in every if len(wave) >= SHORTEST and np.ptp(wave) > 0.0]
     if not waves:
         raise UserError(
             f"sine: no recording has {SHORTEST} rows of slip that changes; record longer stretches"
@@ -80,6 +80,13 @@ def fit_sine(parts: Sequence[np.ndarray], max_slip: float | None = None) -> Fit:
     }
     estimates |= {name: Estimate(float(value), math.nan) for name, value in ends.items()}
     notes = ["Amplitudes and periods are drawn between the least and the greatest of the log."]
+    if len(waves) < len(every):
+        left = 1.0 - sum(map(len, waves)) / sum(map(len, every))
+        notes.append(
+            f"{len(every) - len(waves)} of {len(every)} recordings of an element are shorter than "
+            f"{SHORTEST} rows or do not change, {100 * left:.0f}% of the values: they were left "
+            "out, so neither AIC nor the error can be compared with other kinds."
+        )
     cycles = max(len(wave) / period for wave, period in zip(waves, periods, strict=True))
     if cycles < 1.0:
         notes.append(f"No recording holds a whole period ({cycles:.2f} at most): record longer.")
@@ -91,12 +98,14 @@ def fit_sine(parts: Sequence[np.ndarray], max_slip: float | None = None) -> Fit:
         offset=offset,
         max_slip=bound,
     )
-    mean_square = max(float(np.mean(residual**2)), 1e-16)
+    # As in the other fits, only values with a previous value count, so that AIC is comparable.
+    later = np.concatenate([fit.fun[1:] for fit in fits])
+    mean_square = max(float(np.mean(later**2)), 1e-16)
     return Fit(
         kind="sine",
         process=process,
         estimates=estimates,
-        log_likelihood=gaussian(residual, mean_square),
+        log_likelihood=gaussian(later, mean_square),
         parameters=3 * count + 2,
         error=math.sqrt(mean_square),
         method="least squares of each wave, the period by its profile",

@@ -239,3 +239,32 @@ def test_what_cannot_be_fitted_is_one_line(log, kind, arguments, match):
     with pytest.raises(UserError, match=match) as raised:
         rtd.fit_process(log, kind, **arguments)
     assert "\n" not in str(raised.value)
+
+
+def test_at_its_bound_rho_has_no_error_and_sigma_has_its_own():
+    """Slip that drifts upwards: the likelihood of rho still rises at one."""
+    steps = np.random.default_rng(0).normal(0.003, 0.003, (10, 150, 1))
+    fit = rtd.fit_process(list(np.clip(0.1 + np.cumsum(steps, axis=1), 0, 1)), "ar1")
+    assert fit.estimates["rho"].value == 1 and np.isnan(fit.estimates["rho"].standard_error)
+    sigma, error = fit.estimates["sigma"]
+    assert error == pytest.approx(sigma / np.sqrt(2 * 10 * 149), rel=0.05)
+
+
+def test_what_waves_leave_out_is_said_and_aic_counts_what_the_others_count(tmp_path):
+    chance = np.random.default_rng(0)
+    wave = 0.25 + 0.2 * np.sin(np.arange(100) / 7)[:, None] + chance.normal(0, 0.01, (100, 1))
+    short = [chance.uniform(0, 0.5, (7, 1)) for _ in range(5)]
+    fit = rtd.fit_process([wave, *short], "sine")
+    assert "5 of 6 recordings of an element are shorter than 8 rows" in fit.summary()
+    assert "26% of the values" in fit.summary()
+    whole = rtd.fit_process([wave], "sine")
+    assert not any("left out" in note for note in whole.notes)
+    # 99 values with a previous value, as for ar1.
+    expected = -0.5 * 99 * (np.log(2 * np.pi * whole.error**2) + 1)
+    assert whole.log_likelihood == pytest.approx(expected)
+
+
+def test_slip_of_more_than_two_elements_has_a_picture(tmp_path):
+    log = np.random.default_rng(0).uniform(0, 0.5, (3, 40, 4))
+    rtd.fit_process(list(log), "ar1").plot(tmp_path / "fit.png")
+    assert (tmp_path / "fit.png").stat().st_size > 5_000
