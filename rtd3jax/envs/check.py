@@ -1,5 +1,6 @@
 """Finds common errors of an environment by playing it."""
 
+import contextlib
 import dataclasses
 import functools
 import warnings
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
+from rtd3jax.envs.compat.simulated import fleet_of
 from rtd3jax.envs.compat.simulator_state import without_handles
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import (
@@ -114,7 +116,8 @@ def _findings(env: Any, params: Any, seed: int) -> list[Finding]:
     if findings:  # the other checks would fail for the same reason
         return findings
     assert found.interface is not None
-    with foreign_code():
+    fleet = fleet_of(env)
+    with foreign_code(), contextlib.nullcontext() if fleet is None else fleet.for_a_while():
         return list(_played(env, params, found.interface, seed))
 
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rtd3jax.envs.compat.simulated import release
 from rtd3jax.envs.description import Drawing
 from rtd3jax.envs.disturbed import Disturbed, seen_elements
 from rtd3jax.envs.entry import parameters_of
@@ -20,8 +21,8 @@ from rtd3jax.envs.interface import (
     foreign_code,
 )
 from rtd3jax.envs.registry import description_of
-from rtd3jax.errors import UserError
-from rtd3jax.policies.compatibility import check_compatible
+from rtd3jax.evaluation.rollout import check_counts
+from rtd3jax.policies.compatibility import check_compatible, fitted
 from rtd3jax.protocols import EnvironmentLike, PolicyLike
 from rtd3jax.system.program_cache import make_room
 
@@ -52,7 +53,8 @@ class Trajectory:
         action_low: float32 [A], the lowest action.
         action_high: float32 [A], the highest action.
         observation_names: S names of the undisturbed observation's elements.
-        seen_names: O names of the observed elements.
+        seen_names: O names of the observed elements; ``s[0]``, ``s[1]``, ... if it is not known
+            which elements of the undisturbed observation they are.
         action_names: A names.
         hidden_names: K names.
         environment: the name of the environment.
@@ -82,7 +84,8 @@ class Trajectory:
     @property
     def returns(self) -> np.ndarray:
         """The return of each episode: sums of ``rewards``, float32 [E]."""
-        return np.nansum(self.rewards, axis=1)
+        played = np.arange(self.rewards.shape[1])[None, :] < self.lengths[:, None]
+        return np.sum(self.rewards, axis=1, where=played)
 
     def to_frame(self) -> "pd.DataFrame":
         """A row for each observation of each episode.
@@ -146,9 +149,8 @@ def rollout(
     params = parameters_of(env, params)
     limit = int(getattr(params, "max_steps_in_episode", DEFAULT_STEP_LIMIT))
     steps = limit if steps is None else steps
-    for name, value, low in (("episodes", episodes, 1), ("seed", seed, 0), ("steps", steps, 1)):
-        if isinstance(value, bool) or value != int(value) or not low <= value < 2**32:
-            raise UserError(f"{name} must be an integer of at least {low}, not {value!r}")
+    check_counts(episodes, seed)
+    check_counts(steps, 0, "steps")
     drawing = description_of(env).drawing or Drawing()
     played = play_episodes(
         policy, env, int(episodes), int(seed), min(int(steps), limit), drawing.hidden, params=params
@@ -182,6 +184,7 @@ def play_episodes(
     check_compatible(
         policy, own.observation_size, own.action_shape, own.action_low, own.action_high
     )
+    policy = fitted(policy, own.action_shape)
     make_room()
     frames = _play(policy, env, params, jax.random.key(seed), episodes, steps, hidden)
     return {name: np.asarray(value) for name, value in frames.items()}
@@ -223,9 +226,10 @@ def _play(policy, env, params, key, episodes, steps, hidden):
             frame["hidden"] = jnp.asarray(met, jnp.float32).reshape(episodes, -1)
         return (memory, state, observation.astype(jnp.float32)), frame
 
-    _, frames = jax.lax.scan(
+    (_, state, _), frames = jax.lax.scan(
         step, (memory, state, first), jnp.arange(steps, dtype=jnp.int32), length=steps
     )
+    release(env, state)
     frames = {name: jnp.swapaxes(value, 0, 1) for name, value in frames.items()}
     frames["seen"] = jnp.concatenate([first[:, None], frames["seen"]], axis=1)
     if "true" not in frames:
@@ -281,7 +285,8 @@ def _trajectory(
         action_high=own.action_high,
         observation_names=tuple(names),
         seen_names=tuple(
-            [names[k] for k in elements] if len(elements) == size else element_names((), "o", size)
+            # Names of their own where it is not known which elements a process leaves.
+            [names[k] for k in elements] if len(elements) == size else element_names((), "s", size)
         ),
         action_names=tuple(element_names(drawing.action, "a", played["action"].shape[-1])),
         hidden_names=tuple(f"{drawing.hidden_name} {name}" for name in hidden),

@@ -9,6 +9,7 @@ from jax.typing import ArrayLike
 
 from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT
 from rtd3jax.errors import UserError
+from rtd3jax.evaluation.rollout import check_counts
 from rtd3jax.policies.compatibility import check_compatible
 from rtd3jax.policies.trained import Policy
 from rtd3jax.protocols import PolicyLike
@@ -34,10 +35,7 @@ def run_in_gymnasium(
             action or a reward that is not finite, or, for a policy of this package, with such an
             observation.
     """
-    if isinstance(episodes, bool) or episodes != int(episodes) or episodes < 1:
-        raise UserError(f"episodes must be an integer of at least 1, not {episodes!r}")
-    if isinstance(seed, bool) or seed != int(seed) or seed < 0:
-        raise UserError(f"seed must be an integer of at least 0, not {seed!r}")
+    check_counts(episodes, seed)
     if not isinstance(gym_env, str):
         return _play(policy, gym_env, int(episodes), int(seed))
     try:
@@ -103,7 +101,8 @@ def _check_spaces(policy: PolicyLike, env: gymnasium.Env) -> gymnasium.spaces.Bo
     kind = type(policy).__name__
     seen = jax.ShapeDtypeStruct(observations.shape, np.float32)
     try:
-        shape = jax.eval_shape(_act, policy, jax.eval_shape(policy.init), seen)[0].shape
+        key = jax.eval_shape(lambda: jax.random.key(0))
+        shape = jax.eval_shape(_act, policy, jax.eval_shape(policy.init, key), seen)[0].shape
     except TypeError as error:
         raise UserError(
             f"{kind} cannot be compiled; make it a flax.struct.dataclass: "

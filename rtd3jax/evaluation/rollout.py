@@ -9,7 +9,7 @@ from rtd3jax.envs.compat.simulated import release
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT, describe, foreign_code
 from rtd3jax.errors import UserError
-from rtd3jax.policies.compatibility import check_compatible
+from rtd3jax.policies.compatibility import check_compatible, fitted
 from rtd3jax.protocols import EnvironmentLike, PolicyLike
 from rtd3jax.system.program_cache import make_room
 
@@ -59,6 +59,7 @@ def both_returns(
         interface.action_low,
         interface.action_high,
     )
+    policy = fitted(policy, interface.action_shape)
     return unchecked_returns(policy, env, int(episodes), int(seed), params)
 
 

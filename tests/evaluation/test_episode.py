@@ -1,8 +1,12 @@
 """Tests that the steps of episodes agree with the evaluation, and their names."""
 
+import dataclasses
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from gymnax.environments import environment, spaces
 
 import rtd3jax as rtd
 
@@ -135,3 +139,55 @@ def test_mistakes_are_named(rover):
         rtd.rollout(rtd.bayes_policy(env), env, episodes=0)
     with pytest.raises(rtd.UserError, match=r"action has shape \(1,\), the environment's \(2,\)"):
         rtd.rollout(rtd.constant_policy([0.0]), env)
+
+
+class FirstRemoved(rtd.Process):
+    """Removes the first element, of which nobody is told."""
+
+    def init(self, key, horizon, size):
+        return ()
+
+    def step(self, key, state, signal):
+        return signal[1:], state
+
+
+def test_elements_of_unknown_origin_have_names_of_their_own():
+    env = rtd.disturb(rtd.make("Pendulum-v1"), FirstRemoved())
+    played = rtd.rollout(rtd.constant_policy([0.0]), env, steps=3)
+    assert played.seen_names == ("s[0]", "s[1]")
+    assert played.observation_names == ("o[0]", "o[1]", "o[2]")
+    np.testing.assert_array_equal(played.seen[0], played.true[0, :, 1:])
+
+
+def test_a_reward_that_is_not_a_number_is_not_hidden(pendulum):
+    _, played = pendulum
+    rewards = played.rewards.copy()
+    rewards[0, 3] = np.nan
+    returns = dataclasses.replace(played, rewards=rewards).returns
+    assert np.isnan(returns[0]) and returns[1] == played.returns[1]
+
+
+class Grid(environment.Environment):
+    """The reward is the sum of the first row of an action [2, 3]."""
+
+    @property
+    def default_params(self):
+        return environment.EnvParams(max_steps_in_episode=2)
+
+    def reset_env(self, key, params):
+        return jnp.zeros((1,), jnp.float32), environment.EnvState(jnp.int32(0))
+
+    def step_env(self, key, state, action, params):
+        after = environment.EnvState(state.time + jnp.int32(1))
+        return jnp.zeros((1,), jnp.float32), after, jnp.sum(action[0]), jnp.array(False), {}
+
+    def action_space(self, params):
+        return spaces.Box(0.0, 5.0, (2, 3))
+
+
+def test_a_flat_constant_action_gets_the_environments_shape():
+    flat, env = rtd.constant_policy(np.arange(6.0)), Grid()
+    shaped = rtd.constant_policy(np.arange(6.0).reshape(2, 3))
+    for policy in (flat, shaped):
+        assert float(rtd.evaluate(policy, env, 1)[0]) == 2 * (0 + 1 + 2)
+        assert float(rtd.rollout(policy, env).returns[0]) == 2 * (0 + 1 + 2)

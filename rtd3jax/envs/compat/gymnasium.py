@@ -16,7 +16,8 @@ import numpy as np
 from gymnax.environments import spaces
 from jax.typing import ArrayLike
 
-from rtd3jax.envs.builtin import DISTURBANCES
+from rtd3jax.envs.builtin import LISTED
+from rtd3jax.envs.compat.simulated import is_simulated, release
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import (
     check_final_observation,
@@ -82,6 +83,7 @@ class GymnasiumEnv(gymnasium.Env):
         _check_process()
         super().reset(seed=seed)
         self._key = np.uint32(self.np_random.integers(2**32, dtype=np.uint32))
+        self._release()
         self._time, self._over = 0, False
         observation, self._state = _reset(self.environment, self.params, self._key)
         observation = self._observation(observation)
@@ -111,6 +113,17 @@ class GymnasiumEnv(gymnasium.Env):
             self._episode.add(action, observation, float(reward), info)
         return observation, float(reward), bool(terminated), bool(truncated), info
 
+    def close(self) -> None:
+        """The simulator of this episode, if one plays it, is free for another."""
+        self._release()
+        self._over = True
+        super().close()
+
+    def _release(self) -> None:
+        if self._state is not None and is_simulated(self.environment):
+            release(self.environment, self._state)
+        self._state = None
+
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """A frame, uint8 [height, width, 3]; without a render mode, None and a warning."""
         if self.render_mode is None:
@@ -135,7 +148,7 @@ class _Forked(GymnasiumEnv):
     def __init__(self, key: Any, render_mode: str | None) -> None:
         if key not in _seen:
             _check_process()
-        self.render_mode = render_mode
+        self.render_mode, self._state = render_mode, None
         self.action_space, self.observation_space = _seen[key]
 
 
@@ -191,13 +204,14 @@ def _construct(
 
 
 def gymnasium_id(env_id: str, disturbance: str) -> str:
-    """``rtd3jax/Pendulum-random-sine-v0`` for the pendulum's random-sine."""
-    return f"{NAMESPACE}/{env_id.capitalize()}-{disturbance}-v0"
+    """``rtd3jax/RoverSoil-mixed-v0`` for `rover-soil` under `mixed`."""
+    name = "".join(part.capitalize() for part in env_id.split("-"))
+    return f"{NAMESPACE}/{name}-{disturbance}-v0"
 
 
 def register_with_gymnasium() -> None:
-    """Register every environment with each of its disturbances; no environment is made."""
-    for env_id, disturbances in DISTURBANCES.items():
+    """Register every environment of this package with each of its disturbances; none is made."""
+    for env_id, disturbances in LISTED.items():
         for disturbance in disturbances:
             if gymnasium_id(env_id, disturbance) not in gymnasium.registry:
                 gymnasium.register(

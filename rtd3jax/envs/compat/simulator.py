@@ -268,6 +268,19 @@ class Fleet:
             for simulator in idle:
                 simulator.close()
 
+    @contextlib.contextmanager
+    def for_a_while(self) -> Iterator[None]:
+        """At the end, simulators that were taken in between are closed, also if they are busy.
+
+        Those that another thread took meanwhile are replayed when it asks for them.
+        """
+        before = set(self._busy)
+        with self.in_use():
+            try:
+                yield
+            finally:
+                self.drop(set(self._busy) - before)
+
     def drop(self, handles: Iterable[int]) -> None:
         """Close these; one that failed keeps its fault, for whoever asks what became of it."""
         with self._lock:

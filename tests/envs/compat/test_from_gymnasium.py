@@ -377,3 +377,21 @@ def test_one_that_hangs_is_waited_for_once(monkeypatch):
     simulator.close()
     simulator.close()
     assert waited == [5.0]
+
+
+def test_whoever_plays_leaves_no_simulator_busy():
+    env, policy = environment(), rtd.constant_policy([0.1, 0.1])
+    for _ in range(2):
+        rtd.rollout(policy, env, episodes=3)
+        assert env.fleet.count == 3 and not env.fleet._busy
+    rtd.check_env(env)
+    assert env.fleet.count == 0
+    played = rtd.to_gymnasium(rtd.disturb(env, rtd.Dropout()))
+    for seed in range(3):
+        played.reset(seed=seed)
+        played.step(np.zeros(2, np.float32))
+        assert env.fleet.count == 1
+    played.close()
+    assert not env.fleet._busy
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        played.step(np.zeros(2, np.float32))

@@ -18,6 +18,7 @@ from gymnax.environments import environment, spaces
 import rtd3jax as rtd
 from rtd3jax.envs.compat import gymnasium as gymnasium_env
 from rtd3jax.envs.compat.frames import Episode
+from rtd3jax.envs.builtin import LISTED
 from rtd3jax.envs.compat.gymnasium import gymnasium_id
 from rtd3jax.errors import UserError
 
@@ -70,11 +71,12 @@ def test_it_is_content_with_gymnaxs_own(env_id):
 
 
 def test_every_environment_and_disturbance_is_registered():
-    for env_id, disturbances in rtd.DISTURBANCES.items():
+    for env_id, disturbances in LISTED.items():
         for disturbance in disturbances:
             assert gymnasium_id(env_id, disturbance) in gymnasium.registry
     assert "rtd3jax/Pendulum-random-sine-v0" in gymnasium.registry
     assert "rtd3jax/Rover-ar1-slip-v0" in gymnasium.registry
+    assert "rtd3jax/RoverSoil-mixed-v0" in gymnasium.registry
     env = gymnasium.make("rtd3jax/Rover-dropout-v0", p=0.5, max_steps_in_episode=7)
     assert env.unwrapped.params.process.p == 0.5
     assert env.unwrapped.params.max_steps_in_episode == 7
