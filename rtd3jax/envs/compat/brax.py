@@ -172,7 +172,7 @@ def from_brax(
     """
     if isinstance(env, str):
         env, length = _load(env)
-        max_steps_in_episode = max_steps_in_episode or length
+        max_steps_in_episode = length if max_steps_in_episode is None else max_steps_in_episode
     name = type(env).__name__
     for attribute in ("reset", "step", "action_size"):
         if not hasattr(env, attribute):

@@ -17,8 +17,8 @@ function limits(values, references) {
   let kept = values.filter(finite);
   if (!kept.length) kept = references.map((r) => r.value);
   if (!kept.length) kept = [0];
-  let low = Math.min(...kept);
-  let high = Math.max(...kept);
+  let low = lowest(kept);
+  let high = highest(kept);
   const span = high - low || Math.max(Math.abs(high), 1) * 0.1;
   const isNear = (r) => r.value >= low - span && r.value <= high + span;
   const near = references.filter(isNear);

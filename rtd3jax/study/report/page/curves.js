@@ -13,7 +13,7 @@ function curvePanels() {
     const lows = curves.flatMap((curve) => curve.low.map((low, k) => (finite(low) ? low : curve.iqm[k])));
     const floor = quantile(lows, 0.1);
     const kept = curves.flatMap((curve) => [...curve.low, ...curve.high, ...curve.iqm]).filter((value) => value >= floor);
-    const range = { ...limits(kept, references), cut: Math.min(...lows.filter(finite)) < floor };
+    const range = { ...limits(kept, references), cut: lowest(lows.filter(finite)) < floor };
     for (const length of lengths.length ? lengths : [0]) {
       const here = cells.filter((cell) => cell.length === 0 || cell.length === length);
       panels.push({ environment, length, cells: here, range });
@@ -68,9 +68,9 @@ function curvePanel({ environment, length, cells, range, title: given, under, at
     return figure;
   }
   const height = 230;
-  const last = Math.max(...drawn.map((cell) => Math.max(...cell.curves[state.measure].steps)));
+  const last = highest(drawn.map((cell) => highest(cell.curves[state.measure].steps)));
   // Steps begin at zero and have long numbers; the values of a quantity begin anywhere.
-  const first = under ? Math.min(...drawn.flatMap((cell) => cell.curves[state.measure].steps)) : 0;
+  const first = under ? lowest(drawn.flatMap((cell) => cell.curves[state.measure].steps)) : 0;
   const plot = axes({ width, height, x: [first, last], every: under ? 50 : 90, y: [range.low, range.high], label: title });
   for (const reference of range.near) {
     const y = plot.y(reference.value);

@@ -31,11 +31,15 @@ function fixed(value, decimals) {
   return (value < 0 && !zero ? MINUS : '') + text;
 }
 
+// Math.min(...values) fails for more than about a hundred thousand values.
+const lowest = (values) => values.reduce((a, b) => Math.min(a, b), Infinity);
+const highest = (values) => values.reduce((a, b) => Math.max(a, b), -Infinity);
+
 // The decimals with which the largest value has four significant digits.
 function decimalsFor(values) {
   const largest = Math.max(0, ...values.filter(finite).map(Math.abs));
   if (largest === 0) return 2;
-  return Math.max(0, Math.min(4, 3 - Math.floor(Math.log10(largest))));
+  return Math.max(0, Math.min(12, 3 - Math.floor(Math.log10(largest))));
 }
 
 function compact(value) {

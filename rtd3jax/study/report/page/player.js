@@ -133,7 +133,7 @@ function makeStage(entry, index) {
   const traces = el('div', {});
   const total = run.reward.reduce((sum, [reward]) => sum + reward, 0);
   const title = `${cellName(DATA.cells[entry.cell])}, seed ${entry.seed}: return ${fixed(total, decimalsFor([total]))}` +
-    (entry.cut ? ` over its first ${entry.cut} steps` : '');
+    (entry.cut && run.steps >= entry.cut ? ` over its first ${entry.cut} steps` : '');
   const node = el('div', { class: 'stage' }, el('h3', {}, swatch(DATA.cells[entry.cell].agent), ' ', title), scene, readings, traces);
   const stage = { node, run };
   stage.build = () => {
