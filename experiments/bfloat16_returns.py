@@ -16,13 +16,13 @@ import sys
 
 import numpy as np
 import pandas as pd
-from scipy import stats
 
 import rtd3jax as rtd
 from rtd3jax.study.presets import ROVER_HISTORY_LENGTH, ROVER_SETTINGS, ROVER_STEPS
 from rtd3jax.study.rundir import RunDirectory
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
+from effects import mean_interval  # noqa: E402
 from rover import EPISODES, SEEDS  # noqa: E402
 from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
 
@@ -45,13 +45,6 @@ def evaluate(run: pathlib.Path, seeds: range, episodes: int) -> list[float]:
         float(np.mean(rtd.evaluate(policy, env, episodes, seed=seed)))
         for seed, policy in zip(seeds, policies, strict=True)
     ]
-
-
-def interval(differences: np.ndarray) -> tuple[float, float, float]:
-    """The mean difference of pairs and its 95% interval."""
-    mean, error = float(differences.mean()), float(stats.sem(differences))
-    reach = float(stats.t.ppf(0.975, len(differences) - 1)) * error
-    return mean, mean - reach, mean + reach
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -77,7 +70,7 @@ def main(arguments: list[str] | None = None) -> int:
         {"seed": list(seeds), **{p: evaluate(run, seeds, episodes) for p, run in runs.items()}}
     )
     table["difference"] = table["bfloat16"] - table["float32"]
-    mean, low, high = interval(table["difference"].to_numpy())
+    mean, low, high = mean_interval(table["difference"].to_numpy())
     ceiling = rtd.ceiling(rtd.make("rover", DISTURBANCE)).mean
     text = markdown_table(
         ["seed", "float32", "bfloat16", "difference"],

@@ -21,7 +21,7 @@ import rtd3jax as rtd
 from rtd3jax.study.presets import ROVER_HISTORY_LENGTH, ROVER_SETTINGS, ROVER_STEPS
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-from bfloat16_returns import interval  # noqa: E402
+from effects import mean_interval  # noqa: E402
 from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
 
 AGENT, DISTURBANCE, COUNTS, EPISODES, SEEDS = "lstm-td3-1ha1hc", "ar1-slip", (1, 16), 1_000, 5
@@ -71,7 +71,7 @@ def main(arguments: list[str] | None = None) -> int:
     table = pd.DataFrame(rows)
     one, many = (table[table["environments"] == count] for count in COUNTS)
     differences = many["mean"].to_numpy() - one["mean"].to_numpy()
-    mean, low, high = interval(differences)
+    mean, low, high = mean_interval(differences)
     share = many["cpu_seconds"].mean() / one["cpu_seconds"].mean()
     body = [
         [

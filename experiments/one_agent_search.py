@@ -1,12 +1,13 @@
 """One agent for structure and for noise: which training makes it good under both?
 
-Usage: python experiments/one_agent_search.py [--quick] [--out FILE]
+Usage: python experiments/one_agent_search.py [--quick] [--only N ...] [--out FILE]
 
 The paper's agents are trained under one disturbance, and those of a sine fail under noise. Here
 each episode of the training draws its disturbance from a mixture. Each setting has two seeds, from
 100 on, which are not reported elsewhere, and is tested on 400 episodes of each condition. The
-script writes experiments/results/one_agent_search.csv: a row per setting, losers included. A
-setting that has a row is not trained again.
+script writes experiments/results/one_agent_search.csv: a row per setting that was trained, losers
+included. A setting that has a row is not trained again; `--only` names settings by their place in
+`CHANGES`.
 
 `structured` is the worst of the structured conditions, normalised (0 is the uniform-random policy,
 1 the fully observed optimum); `noise` is the same under noise, divided by that of the model-based

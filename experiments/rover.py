@@ -24,6 +24,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 import rtd3jax as rtd
+from rtd3jax.protocols import EnvironmentLike, PolicyLike
 from rtd3jax.study.plan import make_cells
 from rtd3jax.study.presets import PRESETS
 from rtd3jax.study.presets import ROVER_HISTORY_LENGTH as HISTORY_LENGTH
@@ -32,7 +33,7 @@ from rtd3jax.study.presets import ROVER_STEPS as STEPS
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 import continuing  # noqa: E402
-from effects import Effect  # noqa: E402
+from effects import ROVER_MARGIN, Effect  # noqa: E402
 from settings import mark, notes, setting_text  # noqa: E402
 from writing import (  # noqa: E402
     RESULTS,
@@ -129,21 +130,26 @@ def evaluate_policies(run: pathlib.Path, episodes: int, known: pd.DataFrame | No
 
 
 def references(episodes: int) -> dict[str, dict[str, str]]:
-    """The ceiling and the policies without training, for each process."""
+    """The ceiling and the policies without training, in the episodes of the agents."""
     rows: dict[str, dict[str, str]] = {}
     nominal = rtd.make("rover", "ar1-slip")
     for tested in dict.fromkeys(tested for _, tested in COLUMNS):
         env = rtd.make("rover", tested)
-        best = rtd.ceiling(env, episodes)
-        rows.setdefault("ceiling", {})[tested] = f"{best.mean:.3f} ± {best.standard_error:.3f}"
+
+        def returns(policy: PolicyLike, env: EnvironmentLike = env) -> np.ndarray:
+            found = [rtd.evaluate(policy, env, episodes, seed) for seed in range(SEEDS)]
+            return np.concatenate(found).astype(np.float64)
+
+        best = returns(rtd.bayes_policy(env))
+        error = best.std(ddof=1) / np.sqrt(best.size)
+        rows.setdefault("ceiling", {})[tested] = f"{best.mean():.3f} ± {error:.3f}"
         policies = {
             "Bayes policy told nominal AR(1) slip": rtd.bayes_policy(nominal),
             "constant command": rtd.constant_policy([0.5, 0.0]),
             "uniform random": rtd.random_policy(env),
         }
         for name, policy in policies.items():
-            mean = np.mean(rtd.evaluate(policy, env, episodes, seed=0))
-            rows.setdefault(name, {})[tested] = f"{mean:.2f}"
+            rows.setdefault(name, {})[tested] = f"{returns(policy).mean():.2f}"
     return rows
 
 
@@ -200,8 +206,10 @@ def order(rows: pd.DataFrame) -> str:
     for column, (trained, tested) in list(enumerate(COLUMNS))[:2]:
         ranked = sorted(PAPER, key=lambda name, k=column: -float(PAPER[name][k].split()[0]))
         for better, worse in itertools.pairwise(ranked):
-            sides = (pick(rows, name, trained, tested)["mean"] for name in (better, worse))
-            effect = Effect(f"{better} over {worse}", *(side.to_numpy() for side in sides))
+            sides = [
+                pick(rows, name, trained, tested)["mean"].to_numpy() for name in (better, worse)
+            ]
+            effect = Effect(f"{better} over {worse}", *sides, margin=ROVER_MARGIN)
             body.append([trained, effect.text(), effect.verdict()])
     return markdown_table(header, body)
 

@@ -1,10 +1,12 @@
 """The tables and the picture of experiments/rover_soil.py, from its rows.
 
-Intervals are 95% bootstrap intervals over seeds (10,000 resamples, fixed random numbers). A return
-is minus the sum of squared errors of a drive. The picture shows returns with the sign changed, on a
-logarithmic axis: a lower point is a better policy.
+Intervals are 95% t intervals over seeds; verdicts are those of experiments/effects.py. The margin
+of equivalence on a ground is 2% of the distance between the returns of the constant command and of
+the best controller there. A return is minus the sum of squared errors of a drive. The picture shows
+returns with the sign changed, on a logarithmic axis: a lower point is a better policy.
 """
 
+import functools
 import pathlib
 import sys
 
@@ -15,8 +17,8 @@ from matplotlib.figure import Figure
 import rtd3jax as rtd
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-from claims import BEST, on_the_rover  # noqa: E402
-from effects import combine, resampled_means  # noqa: E402
+from claims import BEST  # noqa: E402
+from effects import MARGIN, Effect, combine, mean_interval  # noqa: E402
 from rover import pick  # noqa: E402
 from writing import markdown_table, seeds_text  # noqa: E402
 
@@ -44,9 +46,14 @@ def text_of(values: np.ndarray, seeds: int) -> str:
     count = seeds_text(len(values), seeds)
     if len(values) == 1:
         return f"{values[0]:.3f}{count}"
-    means = resampled_means(values, np.random.default_rng(0))
-    low, high = np.quantile(means, (0.025, 0.975))
-    return f"{values.mean():.3f} [{low:.3f}, {high:.3f}]{count}"
+    mean, low, high = mean_interval(values)
+    return f"{mean:.3f} [{low:.3f}, {high:.3f}]{count}"
+
+
+def margin_on(rows: pd.DataFrame, ground: str) -> float:
+    """The margin of equivalence on a ground, in units of the return."""
+    found = {name: means_of(rows, name, UNTRAINED, ground).mean() for name in untrained(rows)}
+    return MARGIN * float(max(found.values()) - found["constant command"])
 
 
 def untrained(rows: pd.DataFrame) -> list[str]:
@@ -80,15 +87,16 @@ def claim_14(rows: pd.DataFrame, grounds: tuple[str, ...]) -> str:
     """The paper's claim 14 on each ground: of the agents of sine slip, `BEST` transfers best."""
     body = []
     for ground in grounds:
-        best = means_of(rows, BEST, TRANSFER_SLIP, ground)
+        best, margin = means_of(rows, BEST, TRANSFER_SLIP, ground), margin_on(rows, ground)
         effects = [
-            on_the_rover(f"over {name}", best, means_of(rows, name, TRANSFER_SLIP, ground))
+            Effect(f"over {name}", best, means_of(rows, name, TRANSFER_SLIP, ground), margin)
             for name in rtd.ALGORITHMS
             if name != BEST
         ]
         texts = "; ".join(effect.text() for effect in effects)
-        body.append([ground, combine([effect.verdict() for effect in effects]), texts])
-    header = ["ground", "verdict", f"`{BEST}`, trained on {TRANSFER_SLIP}"]
+        verdict = combine([effect.verdict() for effect in effects])
+        body.append([ground, f"±{margin:.3f}", verdict, texts])
+    header = ["ground", "margin", "verdict", f"`{BEST}`, trained on {TRANSFER_SLIP}"]
     return f"The paper's claim 14, on soil:\n\n{markdown_table(header, body)}"
 
 
@@ -98,14 +106,15 @@ def against(rows: pd.DataFrame, grounds: tuple[str, ...]) -> str:
     for ground in grounds:
         plain = {name: means_of(rows, name, UNTRAINED, ground) for name in untrained(rows)}
         best = max(plain, key=lambda name: plain[name].mean())
+        effect = functools.partial(Effect, margin=margin_on(rows, ground))
         for name in rtd.ALGORITHMS:
             of = {source: means_of(rows, name, source, ground) for source in COLOURS}
             effects = [
-                *(on_the_rover(f"{name}: {SOIL} over {s}", of[SOIL], of[s]) for s in SLIPS),
-                *(on_the_rover(f"{name}: {s} over {best}", of[s], plain[best]) for s in COLOURS),
+                *(effect(f"{name}: {SOIL} over {s}", of[SOIL], of[s]) for s in SLIPS),
+                *(effect(f"{name}: {s} over {best}", of[s], plain[best]) for s in COLOURS),
             ]
             there = [e for e in effects if len(e.better) and len(e.worse)]
-            body += [[ground, effect.text(), effect.verdict()] for effect in there]
+            body += [[ground, found.text(), found.verdict()] for found in there]
     header = ["tested on", "difference of means [95% interval]", "that it is positive"]
     return markdown_table(header, body)
 

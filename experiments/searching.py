@@ -38,12 +38,17 @@ def search_main(
 ) -> None:
     """The command line of a search: ``search(setting, episodes)`` for each of ``changes``.
 
-    With ``--quick``, only the first two, with tiny trainings.
+    With ``--quick``, only the first two, with tiny trainings; with ``--only``, those of these
+    numbers, from 0.
     """
     parser = argparse.ArgumentParser(description=description.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
+    numbers = range(len(changes))
+    parser.add_argument("--only", type=int, nargs="+", metavar="N", choices=numbers)
     parser.add_argument("--out", type=pathlib.Path, default=results)
     options = parser.parse_args(arguments)
+    if options.only:
+        changes = [changes[number] for number in options.only]
     tiny = {}
     if options.quick:
         tiny = {"total_steps": 1_200, "hidden_size": 8}

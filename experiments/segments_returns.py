@@ -30,6 +30,7 @@ from rtd3jax.study import presets
 
 HERE = pathlib.Path(__file__).parent
 sys.path[:0] = [str(HERE), str(HERE.parent)]
+from effects import CONTRADICTED, NO_EFFECT, SUPPORTED, UNDECIDED, Effect  # noqa: E402
 from pendulum import scale  # noqa: E402
 from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
 
@@ -248,6 +249,9 @@ def compare(out: pathlib.Path, tasks: list[str], seeds: int, tiny: dict[str, Any
     return rows
 
 
+WORDS = {SUPPORTED: "gains", CONTRADICTED: "loses", NO_EFFECT: "equal", UNDECIDED: "undecided"}
+
+
 def table(rows: pd.DataFrame, shares: dict[str, float]) -> str:
     """A line per task: both means, the paired difference with its 95% interval, the time."""
     body = []
@@ -257,9 +261,9 @@ def table(rows: pd.DataFrame, shares: dict[str, float]) -> str:
         if len(paired.columns) < 2 or paired.empty:
             continue
         other = own[own["way"] == "windows"]["acting_otherwise"].mean()
-        difference = (paired["segments"] - paired["windows"]).to_numpy()
-        draws = np.random.default_rng(0).choice(difference, (10_000, len(difference))).mean(axis=1)
-        low, high = np.percentile(draws, (2.5, 97.5))
+        sides = (paired[way].to_numpy() for way in ("segments", "windows"))
+        effect = Effect("segments over windows", *sides, paired=True)
+        mean, low, high = effect.interval()
         env, _, length = TASKS[task]
         chosen = CHOSEN[env, length]
         m = chosen["segment_length"]
@@ -270,9 +274,9 @@ def table(rows: pd.DataFrame, shares: dict[str, float]) -> str:
                 f"{paired['windows'].mean():.3f} (worst {paired['windows'].min():.3f})",
                 f"{other:.3f}",
                 f"{paired['segments'].mean():.3f} (worst {paired['segments'].min():.3f})",
-                f"{difference.mean():+.3f} [{low:+.3f}, {high:+.3f}]",
+                f"{mean:+.3f} [{low:+.3f}, {high:+.3f}]",
                 f"{shares[task]:.2f}" if task in shares else "not measured",
-                "holds" if high >= 0 else "loses",
+                WORDS[effect.verdict()],
             ]
         )
     header = ["task", "segments", "windows", "windows, carry", "segments", "difference", "time", ""]
@@ -314,7 +318,7 @@ def main(arguments: list[str] | None = None) -> int:
         agent=AGENT,
         width=WIDTH,
         episodes=EPISODES,
-        difference="of paired seeds, mean and 95% bootstrap interval",
+        difference="of paired seeds, mean and 95% t interval",
         time="of a step with segments, as a share of the windows', in turns on the rover",
         settings={"rover": ROVER, "pendulum": PENDULUM},
     )

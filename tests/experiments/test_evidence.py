@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
+from scipy import stats
 from test_reliability import EXPERIMENTS, load
 
 from rtd3jax.envs.rover_soil.soil import Soil, local_soil
@@ -186,6 +187,34 @@ def test_verdicts_follow_from_the_numbers():
     assert mean == pytest.approx(1.6) and low < mean < high
 
 
+def test_intervals_cover_as_often_as_they_say():
+    """Of five normal values on each side, as often as of many; a bootstrap covers 87%."""
+    effects = load(EXPERIMENTS / "effects.py")
+    chance = np.random.default_rng(0)
+    for paired in (False, True):
+        inside = []
+        for _ in range(2_000):
+            sides = chance.normal(0, 1, 5), chance.normal(0, 1, 5)
+            _, low, high = effects.Effect("", *sides, paired=paired).interval()
+            inside.append(low <= 0 <= high)
+        # Welch's interval is a little too wide with so few values.
+        assert 0.94 < np.mean(inside) < 0.975
+
+
+def test_intervals_are_those_of_scipy():
+    effects = load(EXPERIMENTS / "effects.py")
+    one, other = np.array([0.9, 0.94, 0.92, 0.99]), np.array([0.7, 0.95, 0.8])
+    for paired, test in ((False, stats.ttest_ind), (True, stats.ttest_rel)):
+        sides = (one[:3], other) if paired else (one, other)
+        found = test(*sides, **({} if paired else {"equal_var": False}))
+        expected = found.confidence_interval(0.95)
+        assert effects.Effect("", *sides, paired=paired).interval()[1:] == pytest.approx(expected)
+    # Two one-sided tests: the bound is where the p-value of the weaker one is 5%.
+    bound = effects.Effect("", one, other).bound()
+    weaker = stats.ttest_ind(one, other + bound, equal_var=False, alternative="less")
+    assert weaker.pvalue == pytest.approx(0.05)
+
+
 def test_claims_without_results_are_undecided(tmp_path, capsys):
     load(EXPERIMENTS / "claims.py").main(["--results", str(tmp_path), "--out", str(tmp_path)])
     table = pd.read_parquet(tmp_path / "claims.parquet")
@@ -341,7 +370,7 @@ def test_pairs_of_precisions_are_compared(tmp_path):
     np.testing.assert_allclose(table["difference"], table["bfloat16"] - table["float32"])
     assert len(table) == 2 and "Mean difference" in (tmp_path / "bfloat16_returns.md").read_text()
     # Twice the spread needs twice the interval, and five equal differences none.
-    mean, low, high = pairs.interval(np.array([0.1, 0.3, 0.2, 0.2, 0.2]))
+    mean, low, high = pairs.mean_interval(np.array([0.1, 0.3, 0.2, 0.2, 0.2]))
     assert mean == pytest.approx(0.2) and low == pytest.approx(0.2 - 0.0878, abs=1e-4)
     assert high == pytest.approx(0.2 + 0.0878, abs=1e-4)
 

@@ -16,9 +16,9 @@ from gymnasium.utils.env_checker import check_env
 from gymnax.environments import environment, spaces
 
 import rtd3jax as rtd
+from rtd3jax.envs.builtin import LISTED
 from rtd3jax.envs.compat import gymnasium as gymnasium_env
 from rtd3jax.envs.compat.frames import Episode
-from rtd3jax.envs.builtin import LISTED
 from rtd3jax.envs.compat.gymnasium import gymnasium_id
 from rtd3jax.errors import UserError
 
