@@ -97,7 +97,7 @@ def learning_curves(curves: pd.DataFrame) -> Figure:
                 axes.fill_between(x, low, high, color=LINES.get(length, GREY), alpha=0.15, lw=0)
                 shown[length] = line
             axes.axhline(1.0, color=GREY, lw=0.8)
-            axes.set_ylim(-0.1, 1.05)
+            axes.set_ylim(-0.3, 1.05)
             axes.grid(color="#E4E4E4", lw=0.6)
             middle = {"ha": "center", "transform": axes.transAxes}
             if own.empty:
