@@ -138,7 +138,7 @@ def test_a_killed_simulators_lanes_end_with_the_same_bits(tmp_path):
     ]
     assert sweep.main([*study, "--out", str(tmp_path / "whole")]) == 0
     dying = subprocess.run(
-        [sys.executable, "-c", DYING, "step-", "7", *study, "--out", str(out)],
+        [sys.executable, "-c", DYING, "step-", "5", *study, "--out", str(out)],
         env=cached(),
         capture_output=True,
     )
@@ -225,8 +225,10 @@ def test_the_log_has_each_evaluation_once_however_often_it_was_cut(whole, tmp_pa
 @pytest.mark.slow
 def test_two_processes_with_a_shard_each_merge_to_the_same_tables(whole, tmp_path):
     out = tmp_path / "run"
-    script = "import sys; from rtd3jax import sweep; from rtd3jax.study import references; "
-    script += "references.EPISODES = 2; sys.exit(sweep.main(sys.argv[1:]))"
+    script = "import functools, sys; from rtd3jax import sweep; "
+    script += "from rtd3jax.study import ceilings, references; references.EPISODES = 2; "
+    script += "ceilings.ceiling = functools.partial(ceilings.ceiling, episodes=100); "
+    script += "sys.exit(sweep.main(sys.argv[1:]))"
     processes = [
         subprocess.Popen(
             [sys.executable, "-c", script, *STUDY, "--out", str(out), "--shard", f"{i}/2"],
