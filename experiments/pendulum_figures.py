@@ -97,13 +97,15 @@ def learning_curves(curves: pd.DataFrame) -> Figure:
                 axes.fill_between(x, low, high, color=LINES.get(length, GREY), alpha=0.15, lw=0)
                 shown[length] = line
             axes.axhline(1.0, color=GREY, lw=0.8)
-            axes.set_ylim(-0.3, 1.05)
+            axes.set_ylim(-0.5, 1.05)
             axes.grid(color="#E4E4E4", lw=0.6)
             middle = {"ha": "center", "transform": axes.transAxes}
             if own.empty:
                 axes.text(0.5, 0.5, "not run", va="center", **middle)
-            elif own.groupby("history_length")["seed"].nunique().eq(1).any():
-                note = "one seed's curve was kept"
+            else:
+                kept = own.groupby("history_length")["seed"].nunique()
+                alone = ", ".join(f"l = {length}" for length in kept.index[kept.eq(1)])
+                note = f"{alone}: one seed's curve was kept" if alone else ""
                 axes.text(0.5, 0.04, note, va="bottom", fontsize="x-small", **middle)
             if number == 0:
                 axes.set_title(agent, fontsize=9)
