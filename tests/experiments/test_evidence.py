@@ -84,14 +84,22 @@ def test_the_report_of_the_rover_on_soil(tmp_path):
     ]
     rows += [
         {"algorithm": name, "trained_on": "no training", "tested_on": "mixed", "seed": s, "mean": m}
-        for name, m in (("feed-forward and PI", -0.2), ("adaptive slip estimate", -0.3))
+        for name, m in (
+            ("feed-forward and PI", -0.2),
+            ("adaptive slip estimate", -0.3),
+            ("constant command", -1.2),
+        )
         for s in range(3)
     ]
     rows = pd.DataFrame(rows)
     text = report.tables(rows, ("mixed",), 3)
     assert "| td3 | -1.000 [-1.000, -1.000] | -2.000 [-2.000, -2.000] | -0.200" in text
     assert "| *feed-forward and PI* |  |  |  | -0.200" in text
-    assert "| mixed | undecided | over td3: +1.000 [+1.000, +1.000]; over lstm-td3: too few" in text
+    # The margin is 2% of the distance from -1.2 to -0.2.
+    line = (
+        "| mixed | ±0.020 | undecided | over td3: +1.000 [+1.000, +1.000]; over lstm-td3: too few"
+    )
+    assert line in text
     assert "| mixed | td3: mixed over sine-slip: +1.800 [+1.800, +1.800] | supported |" in text
     assert "td3: sine-slip over feed-forward and PI: -1.800" in text
     report.draw(rows, ("mixed",), tmp_path)

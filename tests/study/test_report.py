@@ -143,6 +143,8 @@ def test_in_a_browser(env, runs):
         # What was measured while they learned is folded, and drawn once it is asked for.
         assert page.locator("#learning .agent-line").count() == 0
         page.locator("#learning summary").click()
+        # The event that draws them comes after the click.
+        page.locator("#learning .agent-line").nth(before - 1).wait_for(state="attached")
         assert page.locator("#learning .agent-line").count() == before
         assert "critic loss" in page.locator("#learning figcaption").first.inner_text()
         if pictures := os.environ.get("RTD3JAX_PAGE_PICTURES"):
