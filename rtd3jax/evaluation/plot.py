@@ -7,6 +7,7 @@ import numpy as np
 from rtd3jax.errors import UserError
 from rtd3jax.evaluation.episode import Trajectory
 from rtd3jax.evaluation.style import STYLE
+from rtd3jax.system.numbers import is_whole
 
 if TYPE_CHECKING:  # importing matplotlib takes two seconds
     from matplotlib.axes import Axes
@@ -40,7 +41,7 @@ def plot_episode(trajectory: Trajectory, episode: int = 0) -> "Figure":
             f"plot_episode needs the result of rtd.rollout, not {type(trajectory).__name__}"
         )
     count = len(trajectory.lengths)
-    if isinstance(episode, bool) or episode != int(episode) or not 0 <= episode < count:
+    if not is_whole(episode) or not 0 <= episode < count:
         raise UserError(f"episode must be an integer from 0 to {count - 1}, not {episode!r}")
     import matplotlib as mpl
     from matplotlib.figure import Figure

@@ -11,6 +11,7 @@ from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT, describe, foreign_code
 from rtd3jax.errors import UserError
 from rtd3jax.policies.compatibility import check_compatible, fitted
 from rtd3jax.protocols import EnvironmentLike, PolicyLike
+from rtd3jax.system.numbers import is_whole
 from rtd3jax.system.program_cache import make_room
 
 
@@ -66,11 +67,7 @@ def both_returns(
 def check_counts(episodes: int, seed: int, name_of_episodes: str = "episodes") -> None:
     """Raise UserError for an impossible number of episodes or an impossible seed."""
     for name, value, low in ((name_of_episodes, episodes, 1), ("seed", seed, 0)):
-        try:
-            whole = not isinstance(value, bool) and value == int(value)
-        except (TypeError, ValueError, OverflowError):
-            whole = False
-        if not whole or not low <= value < 2**32:
+        if not is_whole(value) or not low <= value < 2**32:
             raise UserError(f"{name} must be an integer of at least {low}, not {value!r}")
 
 

@@ -20,6 +20,7 @@ from rtd3jax.errors import UserError
 from rtd3jax.policies.trained import Policy
 from rtd3jax.protocols import EnvironmentLike
 from rtd3jax.system.files import user_path
+from rtd3jax.system.numbers import is_whole
 from rtd3jax.system.switches import check_compiling
 from rtd3jax.training.checkpoint import PLANT, Checkpoints, named_numbers
 from rtd3jax.training.feasibility import check_segments, warn_if_untrained
@@ -364,11 +365,7 @@ def check_seeds(seeds: Iterable[int]) -> tuple[int, ...]:
     """Distinct integers in 0..2**32-1, at least one."""
     seeds = tuple(seeds)
     for seed in seeds:
-        try:
-            whole = not isinstance(seed, bool) and seed == int(seed)
-        except (TypeError, ValueError, OverflowError):
-            whole = False
-        if not whole or not 0 <= seed < 2**32:
+        if not is_whole(seed) or not 0 <= seed < 2**32:
             raise UserError(f"seeds must be integers from 0 to 2**32 - 1, not {seed!r}")
     if not seeds or len(set(seeds)) < len(seeds):
         raise UserError(f"seeds must be distinct and at least one, not {list(seeds)}")

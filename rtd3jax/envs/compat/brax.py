@@ -18,6 +18,7 @@ from jax.typing import ArrayLike
 from rtd3jax.envs.identity import ValueIdentity, strong
 from rtd3jax.envs.interface import foreign_code
 from rtd3jax.errors import UserError, nearest
+from rtd3jax.system.numbers import is_whole
 
 DEFAULT_EPISODE_LENGTH = 1_000
 """Default time limit in steps, as in Brax and in MuJoCo Playground's control suite."""
@@ -181,7 +182,7 @@ def from_brax(
                 "(reset(rng), step(state, action), action_size)"
             )
     length = DEFAULT_EPISODE_LENGTH if max_steps_in_episode is None else max_steps_in_episode
-    if isinstance(length, bool) or length != int(length) or length < 1:
+    if not is_whole(length) or length < 1:
         raise UserError(f"max_steps_in_episode={length!r} must be an integer of at least 1")
     observation_key, size = _observation(name, _first_state(env, name), observation_key)
     indices = tuple(range(size)) if keep is None else tuple(int(index) for index in keep)

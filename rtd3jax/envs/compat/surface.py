@@ -11,6 +11,7 @@ import numpy as np
 
 from rtd3jax.envs.entry import DEFAULT_STEP_LIMIT
 from rtd3jax.errors import UserError
+from rtd3jax.system.numbers import is_whole
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -73,7 +74,7 @@ def surface_of(
     if limit is None:
         spec = getattr(example, "spec", None)
         limit = getattr(spec, "max_episode_steps", None) or DEFAULT_STEP_LIMIT
-    if isinstance(limit, bool) or limit != int(limit) or limit < 1:
+    if not is_whole(limit) or limit < 1:
         raise UserError(f"max_steps_in_episode={limit!r} must be an integer of at least 1")
     size = len(names)
 
