@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
+from jax import lax
 
 from experiments.benchmarks.bench import LENGTHS, RESULTS, machine
 from rtd3jax.agents.memory import lstm
@@ -26,6 +27,7 @@ sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
 from writing import markdown_table, provenance, write_results  # noqa: E402
 
 INPUTS = 5
+PACKAGES_OWN = lstm._activate
 
 
 def gate_by_gate(gates: jax.Array, exists: jax.Array):
@@ -37,15 +39,12 @@ def gate_by_gate(gates: jax.Array, exists: jax.Array):
 
 def without_barrier(gates: jax.Array, exists: jax.Array):
     """One tanh for all gates, which XLA may fuse with the slices."""
-    width = gates.shape[-1] // 4
-    half, one = jnp.full((width,), 0.5, gates.dtype), jnp.ones((width,), gates.dtype)
-    squashed = jnp.tanh(jnp.concatenate((half, half, one, half))[None, :] * gates)
-    i, f, g, o = jnp.split(squashed, 4, axis=-1)
-    return 0.5 * i + 0.5, 0.5 * f + 0.5, jnp.where(exists[:, None], g, 0.0), 0.5 * o + 0.5
+    with mock.patch.object(lax, "optimization_barrier", lambda values: values):
+        return PACKAGES_OWN(gates, exists)
 
 
 WAYS = {
-    "one tanh, barrier": lstm._activate,
+    "one tanh, barrier": PACKAGES_OWN,
     "one tanh": without_barrier,
     "a function per gate": gate_by_gate,
 }
