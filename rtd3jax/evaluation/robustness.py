@@ -17,7 +17,7 @@ from rtd3jax.envs.registry import description_of
 from rtd3jax.envs.stress import SIGNAL_STRESSES, Stress
 from rtd3jax.errors import UserError, first_line, nearest
 from rtd3jax.evaluation.rollout import check_counts, unchecked_returns
-from rtd3jax.policies.compatibility import check_compatible
+from rtd3jax.policies.compatibility import check_compatible, fitted
 from rtd3jax.policies.impaired import ImpairedPolicy
 from rtd3jax.protocols import EnvironmentLike, PolicyLike
 
@@ -59,7 +59,7 @@ class Case:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Returns, and returns of the undisturbed state: float64 [episodes] each."""
         played = ImpairedPolicy(
-            policy,
+            fitted(policy, self.interface.action_shape),
             self.observation,
             self.action,
             getattr(self.params, "max_steps_in_episode", DEFAULT_STEP_LIMIT),

@@ -191,3 +191,4 @@ def test_a_flat_constant_action_gets_the_environments_shape():
     for policy in (flat, shaped):
         assert float(rtd.evaluate(policy, env, 1)[0]) == 2 * (0 + 1 + 2)
         assert float(rtd.rollout(policy, env).returns[0]) == 2 * (0 + 1 + 2)
+        assert rtd.robustness(policy, env, ["delay=0"], 1)["return"].item() == 2 * (0 + 1 + 2)

@@ -17,7 +17,7 @@ from gymnax.environments import spaces
 from jax.typing import ArrayLike
 
 from rtd3jax.envs.builtin import LISTED
-from rtd3jax.envs.compat.simulated import is_simulated, release
+from rtd3jax.envs.compat.simulated import release
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import (
     check_final_observation,
@@ -120,8 +120,7 @@ class GymnasiumEnv(gymnasium.Env):
         super().close()
 
     def _release(self) -> None:
-        if self._state is not None and is_simulated(self.environment):
-            release(self.environment, self._state)
+        release(self.environment, self._state)
         self._state = None
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
@@ -148,7 +147,7 @@ class _Forked(GymnasiumEnv):
     def __init__(self, key: Any, render_mode: str | None) -> None:
         if key not in _seen:
             _check_process()
-        self.render_mode, self._state = render_mode, None
+        self.render_mode, self.environment, self._state = render_mode, None, None
         self.action_space, self.observation_space = _seen[key]
 
 
