@@ -19,7 +19,7 @@ from rtd3jax.envs.registry import parse_disturbance
 from rtd3jax.evaluation.rollout import both_returns
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
+from writing import RESULTS, markdown_table, parse, provenance, write_results  # noqa: E402
 
 DISTURBANCES = (
     "none",
@@ -58,7 +58,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="one disturbance, few episodes")
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
-    options = parser.parse_args(arguments)
+    options = parse(parser, arguments)
     names, episodes = (("hidden",), 4) if options.quick else (DISTURBANCES, EPISODES)
     best = rtd.ceiling(rtd.make("pendulum"))
     rows = []

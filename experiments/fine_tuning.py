@@ -22,7 +22,7 @@ import rtd3jax as rtd
 from rtd3jax.study.presets import ROVER_HISTORY_LENGTH, ROVER_SETTINGS, ROVER_STEPS
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
+from writing import RESULTS, markdown_table, parse, provenance, write_results  # noqa: E402
 
 AGENT, FIRST, THEN, EPISODES, SEEDS = "lstm-td3-1ha1hc", "sine-slip", "ar1-slip", 1_000, 5
 STEPS, ACTOR_STARTS = 5_000, 2_000
@@ -42,7 +42,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--run", type=pathlib.Path, default=pathlib.Path("runs/fine_tuning"))
     parser.add_argument("--seeds", type=int, default=SEEDS)
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
-    options = parser.parse_args(arguments)
+    options = parse(parser, arguments)
     first, then, episodes = {"total_steps": ROVER_STEPS}, {"total_steps": STEPS}, EPISODES
     then |= {"eval_every": 500, "learning_starts": 1_000}
     then |= {"actor_learning_rate": LEARNING_RATE, "critic_learning_rate": LEARNING_RATE}

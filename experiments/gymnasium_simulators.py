@@ -28,7 +28,7 @@ from rtd3jax.study.colours import colour_of
 from rtd3jax.study.presets import PENDULUM_SETTINGS
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
+from writing import RESULTS, markdown_table, parse, provenance, write_results  # noqa: E402
 
 SETTING: dict[str, Any] = {**PENDULUM_SETTINGS, "eval_every": 5_000, "eval_episodes": 5}
 WINDOWS = {"algorithm": "lstm-td3-1ha1hc", "history_length": 3}
@@ -128,7 +128,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
     parser.add_argument("--tasks", nargs="+", choices=(*TASKS, "cost"), default=["pendulum"])
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
-    options = parser.parse_args(arguments)
+    options = parse(parser, arguments)
     tiny: dict[str, Any] = {}
     episodes = EPISODES
     if options.quick:

@@ -22,7 +22,7 @@ from rtd3jax.study.presets import ROVER_HISTORY_LENGTH, ROVER_SETTINGS, ROVER_ST
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from effects import mean_interval  # noqa: E402
-from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
+from writing import RESULTS, markdown_table, parse, provenance, write_results  # noqa: E402
 
 AGENT, DISTURBANCE, COUNTS, EPISODES, SEEDS = "lstm-td3-1ha1hc", "ar1-slip", (1, 16), 1_000, 5
 
@@ -50,7 +50,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
     parser.add_argument("--seeds", type=int, default=SEEDS)
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
-    options = parser.parse_args(arguments)
+    options = parse(parser, arguments)
     tiny, episodes = {}, EPISODES
     if options.quick:
         tiny = {"total_steps": 160, "hidden_size": 4, "batch_size": 4, "learning_starts": 16}

@@ -23,7 +23,7 @@ from rtd3jax.study import presets
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from pendulum import scale  # noqa: E402
-from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
+from writing import RESULTS, markdown_table, parse, provenance, write_results  # noqa: E402
 
 MEMORIES, DISTURBANCES, LENGTH, WIDTH = ("lstm", "gru", "min-gru"), ("noise", "random-sine"), 20, 64
 SETTING = {
@@ -67,7 +67,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
-    options = parser.parse_args(arguments)
+    options = parse(parser, arguments)
     tiny, episodes, memories = {}, 1_000, MEMORIES
     if options.quick:
         tiny = {"total_steps": 260, "learning_starts": 250, "hidden_size": 4, "eval_every": 260}

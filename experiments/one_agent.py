@@ -29,7 +29,7 @@ from rtd3jax.study.transfer import transfer
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from one_agent_search import NOISY, STRUCTURED, reference  # noqa: E402
 from pendulum import normalised  # noqa: E402
-from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
+from writing import RESULTS, markdown_table, parse, provenance, write_results  # noqa: E402
 
 AGENTS = (presets.ROBUST_AGENT,)
 EPISODES, SEEDS = 1_000, 5
@@ -44,7 +44,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--agents", nargs="+", default=list(AGENTS))
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
     parser.add_argument("--report", action="store_true", help="train nothing")
-    options = parser.parse_args(arguments)
+    options = parse(parser, arguments)
     fields, episodes = dict(presets.ROBUST_SETTINGS), EPISODES
     length, conditions = presets.ROBUST_HISTORY_LENGTH, CONDITIONS
     if options.quick:

@@ -24,7 +24,7 @@ from gymnax.environments import environment, spaces
 import rtd3jax as rtd
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-from writing import RESULTS, markdown_table, mean_text, provenance, write_results  # noqa: E402
+from writing import RESULTS, markdown_table, mean_text, parse, provenance, write_results  # noqa: E402
 
 GAMMA, STEPS, SEEDS, EPISODE_LENGTHS = 0.9, 20_000, 3, (1, 8)
 
@@ -64,7 +64,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
-    options = parser.parse_args(arguments)
+    options = parse(parser, arguments)
     agents, seeds, steps = tuple(rtd.ALGORITHMS), SEEDS, STEPS
     fields: dict[str, object] = {"gamma": GAMMA, "hidden_size": 32, "learning_starts": 1_000}
     if options.quick:

@@ -42,6 +42,7 @@ from writing import (  # noqa: E402
     RESULTS,
     markdown_table,
     mean_text,
+    parse,
     provenance,
     write_results,
 )
@@ -264,7 +265,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--disturbances", nargs="+", metavar="D", default=[], help="no others")
     parser.add_argument("--algorithms", nargs="+", metavar="A", default=list(rtd.ALGORITHMS))
     parser.add_argument("--report", action="store_true", help="no training")
-    options = parser.parse_args(arguments)
+    options = parse(parser, arguments)
     began, episodes = time.time(), TEST_EPISODES
     tiny: dict[str, object] = {}
     if options.quick:

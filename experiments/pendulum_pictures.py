@@ -3,7 +3,8 @@
 Usage: python experiments/pendulum_pictures.py [--run DIR] [--disturbance D] [--history-length L]
                                                [--seed N] [--agents A B] [--out DIR] [--quick]
 
-The script loads two policies of a study of experiments/pendulum.py, and plays the same twenty
+The script loads two policies of a study of experiments/pendulum.py (which trains cells that its
+--out does not have), and plays the same twenty
 episodes with both. It shows the episode whose difference of returns is nearest to the mean
 difference (in the median episode, both returns are similar). It writes pendulum_swing.gif: the true
 pendulum, the observed pendulum, and below them the true and the observed angular velocity.
@@ -22,7 +23,7 @@ from rtd3jax.study.report.playback import record_episodes
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from pictures import load_policies, save_gif  # noqa: E402
-from writing import RESULTS  # noqa: E402
+from writing import RESULTS, parse  # noqa: E402
 
 STEPS, EPISODES = 200, 20
 SEEN = "#D55E00"
@@ -67,14 +68,14 @@ def animate(plays: dict[str, dict[str, np.ndarray]], path: pathlib.Path, every: 
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--run", type=pathlib.Path, default=pathlib.Path("runs/pendulum/main"))
+    parser.add_argument("--run", type=pathlib.Path, default=pathlib.Path("runs/pendulum"))
     parser.add_argument("--disturbance", default="random-sine")
     parser.add_argument("--history-length", type=int, default=6)
     parser.add_argument("--seed", type=int, default=0, help="seed of the policies")
     parser.add_argument("--agents", nargs=2, default=["td3", "lstm-td3-1ha1hc"])
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
     parser.add_argument("--quick", action="store_true", help="few frames")
-    options = parser.parse_args(arguments)
+    options = parse(parser, arguments, written=("out",))
     env = rtd.make("pendulum", options.disturbance)
     which = {"disturbance": options.disturbance, "seed": options.seed}
     policies = load_policies(options.run, options.agents, options.history_length, **which)

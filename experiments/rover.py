@@ -40,6 +40,7 @@ from writing import (  # noqa: E402
     keep_curves,
     markdown_table,
     mean_text,
+    parse,
     provenance,
     say,
     seeds_text,
@@ -244,7 +245,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
     parser.add_argument("--steps", type=int, default=STEPS)
     parser.add_argument("--report", action="store_true", help="evaluate without training")
-    options = parser.parse_args(arguments)
+    options = parse(parser, arguments)
     began, steps, episodes = time.time(), options.steps, EPISODES
     tiny: dict[str, object] = {}
     if options.quick:

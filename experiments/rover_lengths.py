@@ -43,6 +43,7 @@ from writing import (  # noqa: E402
     RESULTS,
     markdown_table,
     mean_text,
+    parse,
     provenance,
     say,
     seeds_text,
@@ -172,7 +173,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--slips", nargs="+", choices=SLIPS, default=[*SLIPS])
     parser.add_argument("--algorithms", nargs="+", choices=WITH_WINDOW, default=[*WITH_WINDOW])
     parser.add_argument("--report", action="store_true", help="test without training")
-    options = parser.parse_args(arguments)
+    options = parse(parser, arguments)
     began, episodes, seeds = time.time(), EPISODES, range(SEEDS)
     tiny: dict[str, object] = {}
     if options.quick:

@@ -20,7 +20,7 @@ import rtd3jax as rtd
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from pictures import load_policies, save_gif  # noqa: E402
-from writing import RESULTS  # noqa: E402
+from writing import RESULTS, parse  # noqa: E402
 
 COLOURS = {"td3": "#000000", "lstm-td3-1ha1hc": "#009E73"}
 STEPS, SECONDS_PER_STEP = 200, 0.1
@@ -130,7 +130,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--agents", nargs=2, default=["td3", "lstm-td3-1ha1hc"])
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
     parser.add_argument("--quick", action="store_true", help="few frames")
-    options = parser.parse_args(arguments)
+    options = parse(parser, arguments, written=("out",))
     env = rtd.make("rover", "ar1-slip")
     policies = load_policies(options.run, options.agents, disturbance="ar1-slip", seed=options.seed)
     drives = {name: drive(policy, env, seed=3) for name, policy in policies.items()}

@@ -39,7 +39,7 @@ from continuing import (  # noqa: E402
 )
 from rover import EPISODES, SEEDS, TINY  # noqa: E402
 from rover_soil_report import GROUNDS, SLIPS, SOIL, UNTRAINED, draw, tables  # noqa: E402
-from writing import RESULTS, provenance, say, write_results  # noqa: E402
+from writing import RESULTS, parse, provenance, say, write_results  # noqa: E402
 
 SOURCES = ("sine-slip", SOIL, "ar1-slip")
 """What agents are trained on, in an order that soon gives a useful table."""
@@ -129,7 +129,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--steps", type=int, default=STEPS)
     parser.add_argument("--sources", nargs="+", choices=SOURCES, default=list(SOURCES), metavar="S")
     parser.add_argument("--report", action="store_true", help=UNTRAINED)
-    options = parser.parse_args(arguments)
+    options = parse(parser, arguments)
     began, steps, episodes, seeds = time.time(), options.steps, EPISODES, SEEDS
     tiny: dict[str, object] = {}
     grounds = GROUNDS

@@ -20,7 +20,7 @@ from rtd3jax.envs.rover_soil.controllers import adaptive_slip
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from continuing import mean_and_error  # noqa: E402
-from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
+from writing import RESULTS, markdown_table, parse, provenance, write_results  # noqa: E402
 
 GROUND, SEED, EPISODES = "mixed-slope", 1000, 1_000
 PROPORTIONAL = (0.0, 0.1, 0.2, 0.3)
@@ -32,7 +32,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="tiny, to see that it runs")
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
-    options = parser.parse_args(arguments)
+    options = parse(parser, arguments)
     env, episodes = rtd.make("rover-soil", GROUND), EPISODES
     pairs, shares = [(p, i) for p in PROPORTIONAL for i in INTEGRAL], SHARES
     if options.quick:

@@ -35,7 +35,7 @@ from rtd3jax.envs.rover_soil.soil import DRY_SAND, REFERENCE_SINKAGE, LocalSoil
 from rtd3jax.envs.rover_soil.wheel import Wheel, contact_forces
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
+from writing import RESULTS, markdown_table, parse, provenance, write_results  # noqa: E402
 
 WHEEL, LOAD = Wheel(radius=0.15735, width=0.165), 80.0
 SLIP = np.array([0.0, 0.1, 0.2, 0.3, 0.4, 0.6])
@@ -149,7 +149,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="one start of each fit")
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
-    options = parser.parse_args(arguments)
+    options = parse(parser, arguments)
     starts = 1 if options.quick else STARTS
     ways = {
         "published parameters": np.array(PUBLISHED),

@@ -2,9 +2,13 @@
 
 import argparse
 import pathlib
+import sys
 from collections.abc import Callable, Iterable, Sequence
 
 import pandas as pd
+
+sys.path.insert(0, str(pathlib.Path(__file__).parent))
+from writing import parse  # noqa: E402
 
 
 def go_through(
@@ -46,7 +50,7 @@ def search_main(
     numbers = range(len(changes))
     parser.add_argument("--only", type=int, nargs="+", metavar="N", choices=numbers)
     parser.add_argument("--out", type=pathlib.Path, default=results)
-    options = parser.parse_args(arguments)
+    options = parse(parser, arguments)
     if options.only:
         changes = [changes[number] for number in options.only]
     tiny = {}

@@ -32,7 +32,7 @@ HERE = pathlib.Path(__file__).parent
 sys.path[:0] = [str(HERE), str(HERE.parent)]
 from effects import CONTRADICTED, NO_EFFECT, SUPPORTED, UNDECIDED, Effect  # noqa: E402
 from pendulum import scale  # noqa: E402
-from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
+from writing import RESULTS, markdown_table, parse, provenance, write_results  # noqa: E402
 
 from experiments.benchmarks.ours import Lanes, make_config  # noqa: E402
 from rtd3jax.training.lanes import workers  # noqa: E402
@@ -295,7 +295,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS), metavar="T")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
-    options = parser.parse_args(arguments)
+    options = parse(parser, arguments)
     tiny: dict[str, Any] = {}
     if options.quick:
         tiny = {"total_steps": 260, "learning_starts": 250, "hidden_size": 4, "eval_every": 260}

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 import rtd3jax as rtd
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
+from writing import RESULTS, markdown_table, parse, provenance, write_results  # noqa: E402
 
 PROCESSES = (
     "ar1-slip",
@@ -62,7 +62,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="few episodes")
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
-    options = parser.parse_args(arguments)
+    options = parse(parser, arguments)
     episodes = 20 if options.quick else 4_000
     edges = np.linspace(0.0, 0.5, 51)
     rows, lines = [], []

@@ -1,5 +1,6 @@
 """Writes the table of an experiment, and the facts about its run."""
 
+import argparse
 import datetime
 import json
 import os
@@ -12,6 +13,30 @@ import numpy as np
 import pandas as pd
 
 RESULTS = pathlib.Path(__file__).parent / "results"
+QUICK = pathlib.Path("runs/quick")
+
+
+def parse(
+    parser: argparse.ArgumentParser,
+    arguments: list[str] | None,
+    written: tuple[str, ...] = ("out", "run"),
+) -> argparse.Namespace:
+    """The options. With ``--quick``, nothing is written to the directories of the full run.
+
+    Instead of the defaults of the options ``written``, a quick run has places in runs/quick. It is
+    an error to name the default of ``--out``.
+    """
+    options = parser.parse_args(arguments)
+    for name in written if options.quick else ():
+        default, given = parser.get_default(name), getattr(options, name, None)
+        if given is None:
+            continue
+        if given is default:
+            is_study_or_file = name == "run" or default.suffix
+            setattr(options, name, QUICK / default.name if is_study_or_file else QUICK)
+        elif name == "out" and given.resolve() == default.resolve():
+            parser.error("the results of --quick have no meaning: choose another --out")
+    return options
 
 
 def provenance(**facts: object) -> dict[str, object]:

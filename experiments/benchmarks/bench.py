@@ -38,6 +38,7 @@ from experiments.benchmarks.torch_processes import (
     TorchProcesses,
     is_installed,
 )
+from experiments.writing import parse
 from rtd3jax.envs.interface import foreign_code
 from rtd3jax.errors import UserError
 from rtd3jax.system.files import write_bytes_atomically
@@ -324,7 +325,7 @@ def _measure_extras(bench: Bench, done: Measurements, with_compiling: bool) -> N
             print(f"{title}: measured", flush=True)
 
 
-def parse(arguments: list[str] | None) -> argparse.Namespace:
+def read_options(arguments: list[str] | None) -> argparse.Namespace:
     """The options, after the changes of ``--quick``."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
@@ -335,7 +336,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
     parser.add_argument("--fresh", action="store_true", help="rename earlier measurements")
     parser.add_argument("--no-torch", action="store_true", help="leave PyTorch out")
-    options = parser.parse_args(arguments)
+    options = parse(parser, arguments)
     quick = options.quick
     options.agents = options.agents or ([report.ONE_STREAM] if quick else list(rtd.ALGORITHMS))
     options.lengths = options.lengths or ([1] if quick else list(LENGTHS))
@@ -343,13 +344,11 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     options.seconds = options.seconds or (0.05 if quick else 1.8)
     if min(options.lengths) < 1 or options.repeats < 1 or options.seconds <= 0:
         parser.error("--lengths, --repeats and --seconds must be positive")
-    if quick and options.out == RESULTS:
-        parser.error("the results of --quick have no meaning: choose another --out")
     return options
 
 
 def main(arguments: list[str] | None = None) -> int:
-    options = parse(arguments)
+    options = read_options(arguments)
     with_torch = is_installed() and not options.no_torch
     if not with_torch:
         why = "--no-torch" if options.no_torch else "it is not installed: pip install '.[bench]'"

@@ -25,7 +25,7 @@ from rtd3jax.errors import UserError
 from rtd3jax.training.lanes import workers
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
-from writing import RESULTS, markdown_table  # noqa: E402
+from writing import RESULTS, markdown_table, parse  # noqa: E402
 
 AGENT = products.AGENT
 
@@ -96,7 +96,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="a small run to test the script")
     parser.add_argument("--lengths", type=int, nargs="+", default=list(LENGTHS))
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS / "benchmarks")
-    options = parser.parse_args(arguments)
+    options = parse(parser, arguments)
     sizes = QUICK if options.quick else Sizes()
     try:
         there = Measurements(options.out / "measurements.csv", fresh=False, machine=machine())

@@ -22,7 +22,7 @@ from experiments.benchmarks.bench import RESULTS, machine
 from rtd3jax.system.machine import cores
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
-from writing import markdown_table, provenance, write_results  # noqa: E402
+from writing import markdown_table, parse, provenance, write_results  # noqa: E402
 
 ROOT = pathlib.Path(__file__).parents[2]
 WORKER = """
@@ -87,7 +87,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--seconds", type=float, default=2.0)
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
-    options = parser.parse_args(arguments)
+    options = parse(parser, arguments)
     size = 128
     if options.quick:
         options.lengths, options.rounds, options.seconds, size = [1], 2, 0.05, 8

@@ -28,7 +28,7 @@ from rtd3jax.study.plan import update_flops
 from rtd3jax.training.lanes import workers
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
-from writing import RESULTS, markdown_table  # noqa: E402
+from writing import RESULTS, markdown_table, parse  # noqa: E402
 
 AGENT = "lstm-td3-1ha1hc"
 SERIAL = {"xla_cpu_multi_thread_eigen": False}
@@ -165,7 +165,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--lengths", type=int, nargs="+", default=[1, 6, 20])
     parser.add_argument("--threads", type=int, default=len(workers()), help="[one per core]")
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS / "benchmarks")
-    options = parser.parse_args(arguments)
+    options = parse(parser, arguments)
     batch, width, size, least, rounds = 100, 128, 2048, 0.3, 5
     if options.quick:
         batch, width, size, least, rounds, options.lengths = 4, 8, 64, 1e-4, 1, [1]

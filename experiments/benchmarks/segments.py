@@ -27,7 +27,7 @@ from experiments.benchmarks.torch_processes import PROCESS_PER_CORE, TorchProces
 from rtd3jax.training.lanes import workers
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
-from writing import markdown_table, provenance, write_results  # noqa: E402
+from writing import markdown_table, parse, provenance, write_results  # noqa: E402
 
 
 def ways(segment_lengths: list[int], batch_size: int) -> dict[str, dict[str, object]]:
@@ -100,7 +100,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--width", type=int, default=128)
     parser.add_argument("--torch", action="store_true", help="also measure PyTorch's windows")
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
-    options = parser.parse_args(arguments)
+    options = parse(parser, arguments)
     if options.quick:
         options.lengths, options.segment_lengths, options.repeats = [1], [5], 1
         options.seconds, options.batch_size, options.width = 0.05, 10, 8

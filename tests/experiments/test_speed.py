@@ -68,12 +68,6 @@ def test_no_step_copies_the_replay(measured):
         assert not [line for line in lines if " copy(" in line]
 
 
-def test_quick_results_do_not_mix_with_real_ones(capsys):
-    with pytest.raises(SystemExit):
-        bench.main(["--quick"])
-    assert "--out" in capsys.readouterr().err
-
-
 def test_td3_has_one_cell():
     assert bench.cells(["td3", "h-td3"], [1, 3]) == [("td3", 0), ("h-td3", 1), ("h-td3", 3)]
 
