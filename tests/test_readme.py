@@ -1,11 +1,13 @@
 """Runs the Python code of the README and of docs/."""
 
+import dataclasses
 import pathlib
 import re
 
 import pytest
 
 from rtd3jax.envs import registry
+from rtd3jax.envs.builtin import LISTED
 
 ROOT = pathlib.Path(__file__).parent.parent
 PACKAGE = ROOT / "rtd3jax"
@@ -54,3 +56,16 @@ def test_modules_that_are_named_exist(path):
 def test_where_is_has_twenty_places():
     named = re.findall(r"`((?:[a-z_]+/)+[a-z_]+\.py)`", (ROOT / "CONTRIBUTING.md").read_text())
     assert len(set(named)) >= 20
+
+
+@pytest.mark.parametrize("env", LISTED)
+def test_the_table_of_disturbances_has_every_name_and_default(env):
+    text = (ROOT / "docs" / "run_a_study.md").read_text().split("## Disturbances\n")[1]
+    table = [line for line in text.split("\n## ")[0].splitlines() if line.startswith("| `")]
+    named = {**registry._entries[env].disturbances, **registry._FAULTS}
+    for name, (_, process) in named.items():
+        (row,) = [line for line in table if f"`{name}`" in line.split("|")[1]]
+        for field in dataclasses.fields(process):
+            value = getattr(process, field.name)
+            if isinstance(value, int | float | tuple):
+                assert f"`{field.name}=" in row and repr(value) in row, name
