@@ -5,6 +5,8 @@ QUICK_TO_COMPILE = {
     # of a fusion takes half of that again.
     "--xla_backend_optimization_level": "0",
     "--xla_cpu_use_fusion_emitters": "false",
+    # A module is not split into parts for threads: the workers of the tests have all cores.
+    "--xla_cpu_parallel_codegen_split_count": "1",
 }
 
 

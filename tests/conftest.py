@@ -30,10 +30,24 @@ matplotlib.use("Agg")
 
 
 @pytest.fixture(autouse=True, scope="session")
-def ceilings_of_few_episodes():
-    """The ceilings in a study's tables and figures are means of 100 episodes, not of 20,000."""
-    from rtd3jax.study import ceilings
+def quick_studies():
+    """Studies end sooner: they draw no pictures, and play few episodes of other policies.
+
+    The ceilings in tables and figures are means of 100 episodes, not of 20,000.
+    """
+    from rtd3jax.study import ceilings, references
+    from rtd3jax.study.derive import derive
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ceilings, "ceiling", functools.partial(ceilings.ceiling, episodes=100))
+        patch.setattr(references, "EPISODES", 2)
+        patch.setattr(derive, "__kwdefaults__", {"pictures": False})
         yield
+
+
+@pytest.fixture
+def pictures(monkeypatch):
+    """Studies draw their pictures after all."""
+    from rtd3jax.study.derive import derive
+
+    monkeypatch.setattr(derive, "__kwdefaults__", {"pictures": True})

@@ -17,7 +17,7 @@ import pytest
 
 from rtd3jax import sweep
 from rtd3jax.errors import UserError
-from rtd3jax.study import process_plan, processes, references
+from rtd3jax.study import process_plan, processes
 from rtd3jax.study.crew import Crew
 from rtd3jax.study.lock import is_held
 from rtd3jax.study.log import LOG, read_log
@@ -34,11 +34,6 @@ STUDY = [
     *("--eval-episodes", "1", "--final-episodes", "2", "--checkpoint-every", "300steps"),
     *("--quiet", "--no-report"),
 ]
-
-
-@pytest.fixture(autouse=True)
-def few_reference_episodes(monkeypatch):
-    monkeypatch.setattr(references, "EPISODES", 2)
 
 
 @pytest.fixture(autouse=True)
@@ -64,9 +59,7 @@ def contents(out):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     out = tmp_path_factory.mktemp("whole") / "run"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(references, "EPISODES", 2)
-        assert run(out, "--processes", "1") == 0
+    assert run(out, "--processes", "1") == 0
     return out
 
 

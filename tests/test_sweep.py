@@ -25,8 +25,7 @@ TINY = [
 
 
 @pytest.fixture(autouse=True)
-def few_reference_episodes(monkeypatch):
-    monkeypatch.setattr(references, "EPISODES", 2)
+def no_page(monkeypatch):
     monkeypatch.setattr(finish, "refresh_page", lambda *_, **__: None)
 
 
@@ -34,7 +33,7 @@ def _files(directory, *names):
     return [(directory / name).read_bytes() for name in names]
 
 
-def test_a_run_directory_holds_what_it_should(tmp_path, capsys, monkeypatch):
+def test_a_run_directory_holds_what_it_should(tmp_path, capsys, monkeypatch, pictures):
     out = tmp_path / "run"
     pages = []
     monkeypatch.setattr(finish, "refresh_page", lambda run, complete: pages.append(complete))
@@ -172,22 +171,21 @@ def test_presets_have_the_settings_that_were_searched():
 
 
 def test_a_study_may_hold_trainings_of_different_lengths(tmp_path, capsys, monkeypatch):
-    settings = {"total_steps": 40, "learning_starts": 10, "batch_size": 4, "hidden_size": 4}
-    tiny = {**settings, "eval_every": 20, "eval_episodes": 1}
-    grid = Grid(
-        "rover", ("ar1-slip",), ("td3", "h-td3"), (1,), tiny, {"h-td3": {"total_steps": 80}}
-    )
+    settings = {"total_steps": 60, "learning_starts": 10, "batch_size": 4, "hidden_size": 4}
+    tiny = {**settings, "eval_every": 30, "eval_episodes": 1}
+    agents = ("td3", "lstm-td3-1ha1hc")
+    grid = Grid("rover", ("ar1-slip",), agents, (2,), tiny, {"td3": {"total_steps": 90}})
     monkeypatch.setitem(PRESETS, "quick", (grid,))
     run = tmp_path / "run"
-    command = ["--preset", "quick", "--seeds", "1", "--final-episodes", "1", "--out", str(run)]
+    command = ["--preset", "quick", "--seeds", "1", "--final-episodes", "2", "--out", str(run)]
     assert sweep.main(command) == 0
     curves = pd.read_parquet(run / "curves.parquet")
-    assert curves.groupby("algorithm")["step"].max().to_dict() == {"td3": 40, "h-td3": 80}
-    assert "- total_steps: 40 (td3); 80 (h-td3)\n" in (run / "summary.md").read_text()
+    assert curves.groupby("algorithm")["step"].max().to_dict() == {"td3": 90, agents[1]: 60}
+    assert "- total_steps: 90 (td3); 60 (lstm-td3-1ha1hc)\n" in (run / "summary.md").read_text()
     capsys.readouterr()
     assert sweep.main([*command, "--status"]) == 0
     status = capsys.readouterr().out.splitlines()
-    assert [line.split()[-2:] for line in status[:2]] == [["done", "40"], ["done", "80"]]
+    assert [line.split()[-2:] for line in status[:2]] == [["done", "90"], ["done", "60"]]
 
 
 def test_status_names_every_lane(tmp_path, capsys):
@@ -287,6 +285,7 @@ def test_a_full_disk_is_one_line_and_loses_nothing(tmp_path, monkeypatch, capsys
 
 def test_a_module_that_registers_environments_can_be_imported(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(time_estimate, "group_seconds", lambda jobs: 1.0)
     monkeypatch.setattr(registry, "_entries", dict(registry._entries))
     (tmp_path / "own_environments.py").write_text(
         "import rtd3jax as rtd\nrtd.register('own', rtd.make('rover'))\n"

@@ -14,7 +14,7 @@ import jax
 import pytest
 
 from rtd3jax import sweep
-from rtd3jax.study import finish, recorder, references
+from rtd3jax.study import finish, recorder
 from rtd3jax.study.derive import derive
 from rtd3jax.study.log import LOG, lane_of, read_log
 from rtd3jax.study.rundir import RunDirectory
@@ -29,8 +29,7 @@ TABLES = "curves.parquet", "episodes.parquet", "summary.md"
 
 
 @pytest.fixture(autouse=True)
-def few_reference_episodes(monkeypatch):
-    monkeypatch.setattr(references, "EPISODES", 2)
+def no_page(monkeypatch):
     monkeypatch.setattr(finish, "refresh_page", lambda *_, **__: None)
 
 
@@ -46,7 +45,6 @@ def contents(out):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(references, "EPISODES", 2)
         patch.setattr(finish, "refresh_page", lambda *_, **__: None)
         out = tmp_path_factory.mktemp("whole") / "run"
         assert run(out) == 0

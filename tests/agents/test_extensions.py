@@ -179,18 +179,19 @@ def test_the_actor_of_an_added_learner_waits_as_long_as_it_is_told():
     assert moved("actor") == [21] and moved("critic") == list(range(1, 22))
 
 
-def test_a_seventh_agent_sweeps_draws_reports_and_loads(tmp_path):
+def test_a_seventh_agent_sweeps_draws_reports_and_loads(tmp_path, pictures):
     out = tmp_path / "run"
     flags = [f"--{name.replace('_', '-')}={value}" for name, value in TINY.items()]
     flags = [flag for flag in flags if "history" not in flag]
     arguments = [
-        *("--env", "rover", "--algorithms", "rdpg", "td3", "--history-lengths", "2"),
+        *("--env", "rover", "--disturbances", "ar1-slip", "--algorithms", "rdpg", "td3"),
+        *("--history-lengths", "2", "--no-report"),
         *("--seeds", "1", "--final-episodes", "2", "--out", str(out), "--quiet", *flags),
     ]
     assert sweep.main(arguments) == 0
+    assert report.main([str(out)]) == 0
     page = (out / "report.html").read_text()
     assert "rdpg" in page and (out / "learning_curves.png").exists()
-    assert report.main([str(out)]) == 0
     assert rtd.load_policy(out, algorithm="rdpg").algorithm == "rdpg"
 
 

@@ -97,7 +97,7 @@ def test_gradients_are_those_of_one_step_after_another(float64, name):
                 jnp.sum(part**2) for part in jax.tree.leaves(end)
             )
 
-        return jax.grad(of, argnums=(0, 1, 2))(params, tokens, start)
+        return jax.jit(jax.grad(of, argnums=(0, 1, 2)))(params, tokens, start)
 
     fast = loss(lambda p, x, c: memory.apply({"params": p}, c, x, starts, method="scan"))
     slow = loss(lambda p, x, c: _one_by_one(memory, p, x, starts, c))

@@ -1,6 +1,5 @@
 """Compares segments with windows: targets, losses and gradients of every agent."""
 
-import dataclasses
 import functools
 
 import jax
@@ -82,9 +81,8 @@ def _networks(agent, memory="lstm"):
     return networks, online.replace(target_actor=other.actor, target_critics=other.critics)
 
 
-def _learned(networks, state, batch, order):
-    """The target, and losses with their gradients; ``order`` sorts the batch's rows alike."""
-    batch = dataclasses.replace(batch, terminated=batch.terminated, reward=batch.reward)
+def _learned(networks, state, batch):
+    """The target, and losses with their gradients."""
     numbers = _numbers(target_noise=0.0)
     y = td3.target(networks, state, batch, jax.random.key(0), numbers)
     critic = jax.value_and_grad(td3.critic_loss, has_aux=True)(
@@ -93,7 +91,7 @@ def _learned(networks, state, batch, order):
     actor = jax.value_and_grad(td3.actor_loss, has_aux=True)(
         state.actor, state.critics[0], networks, batch, jax.random.key(0), jnp.float32(0.0)
     )
-    return y[order], critic, actor
+    return y, critic, actor
 
 
 OFTEN = ("lstm-td3", "lstm-td3-1ha1hc", "h-td3")
@@ -121,7 +119,7 @@ def test_with_whole_episodes_they_learn_what_windows_do(agent):
         np.testing.assert_array_equal(
             *(np.asarray(jax.tree.leaves(getattr(b, name))) for b in (segments, windows))
         )
-    learn = jax.jit(functools.partial(_learned, networks, state, order=slice(None)))
+    learn = jax.jit(functools.partial(_learned, networks, state))
     for got, want in zip(
         jax.tree.leaves(learn(segments)), jax.tree.leaves(learn(windows)), strict=True
     ):
@@ -139,17 +137,19 @@ def test_every_step_has_the_burn_in_and_what_lies_between(own, memory):
         replay, first, jnp.int32(count), tokens, jnp.int32(own), length, burn_in_gradient=True
     )
     critic = networks.critic, state.critics[0]
+    gathered = jax.jit(gather, static_argnums=3)
+    carry = jax.jit(carry_before, static_argnums=0)
     before, after = (
         [np.asarray(leaf).reshape(length, len(first), -1) for leaf in jax.tree.leaves(carries)]
         for carries in segment_carries(*critic, batch.window)
     )
     for j in range(length):
-        wider = gather(replay, first + j, jnp.int32(count), tokens + length, own + j)
+        wider = gathered(replay, first + j, jnp.int32(count), tokens + length, own + j)
         for got, window in ((before, wider.window), (after, None)):
             if window is None:
-                following = gather(replay, first + j, jnp.int32(count), 9, own + j + 1)
+                following = gathered(replay, first + j, jnp.int32(count), 9, own + j + 1)
                 window = following.next_window
-            want = jax.tree.leaves(carry_before(*critic, window))
+            want = jax.tree.leaves(carry(*critic, window))
             for leaf, expected in zip(got, want, strict=True):
                 np.testing.assert_allclose(leaf[j], expected, atol=1e-6)
 

@@ -18,6 +18,8 @@ from rtd3jax.agents.replay import Batch
 from rtd3jax.registries import AGENTS
 
 B, L, WIDTH = 6, 2, 16
+target = jax.jit(td3.target, static_argnums=0)
+update_actor_and_targets = jax.jit(td3.update_actor_and_targets, static_argnums=0)
 
 
 def _numbers(**changes):
@@ -75,7 +77,7 @@ def problem(request):
 
 def test_target_is_the_formula(problem):
     networks, learner, batch = problem
-    got = td3.target(networks, learner, batch, jax.random.key(9), _numbers())
+    got = target(networks, learner, batch, jax.random.key(9), _numbers())
     noise = np.clip(0.2 * np.asarray(jax.random.normal(jax.random.key(9), (B, 1))), -0.3, 0.3)
     output = apply_network(networks.actor, learner.target_actor, batch.next_window)
     action = np.clip(np.tanh(np.asarray(output)) + noise, -1.0, 1.0)
@@ -84,7 +86,7 @@ def test_target_is_the_formula(problem):
         for critic in learner.target_critics
     ]
     assert not np.allclose(*values)
-    scaled = td3.target(networks, learner, batch, jax.random.key(9), _numbers(reward_scale=5))
+    scaled = target(networks, learner, batch, jax.random.key(9), _numbers(reward_scale=5))
     np.testing.assert_allclose(scaled - got, 4 * np.asarray(batch.reward), rtol=1e-4, atol=1e-5)
     bootstrap = 0.9 * np.minimum(*values)[:, 0] * ~np.asarray(batch.terminated)
     np.testing.assert_allclose(got, np.asarray(batch.reward) + bootstrap, rtol=1e-5, atol=1e-6)
@@ -92,15 +94,15 @@ def test_target_is_the_formula(problem):
 
 def test_target_noise_is_clipped(problem):
     networks, learner, batch = problem
-    wide = td3.target(networks, learner, batch, jax.random.key(1), _numbers(target_noise=99))
-    still = td3.target(
+    wide = target(networks, learner, batch, jax.random.key(1), _numbers(target_noise=99))
+    still = target(
         networks,
         learner,
         batch,
         jax.random.key(1),
         _numbers(target_noise=99, target_noise_clip=0),
     )
-    none = td3.target(networks, learner, batch, jax.random.key(1), _numbers(target_noise=0))
+    none = target(networks, learner, batch, jax.random.key(1), _numbers(target_noise=0))
     np.testing.assert_allclose(still, none, rtol=1e-6)
     assert not np.allclose(wide, none)
 
@@ -121,7 +123,8 @@ def test_the_actor_climbs_the_first_critic(problem):
         action = jnp.tanh(apply_network(networks.actor, actor, batch.window))
         return -jnp.mean(apply_network(networks.critic, learner.critics[0], batch.window, action))
 
-    (value, saturated), gradient = jax.value_and_grad(td3.actor_loss, has_aux=True)(
+    compiled = jax.jit(jax.value_and_grad(td3.actor_loss, has_aux=True), static_argnums=2)
+    (value, _), gradient = compiled(
         learner.actor,
         learner.critics[0],
         networks,
@@ -129,7 +132,7 @@ def test_the_actor_climbs_the_first_critic(problem):
         jax.random.key(3),
         jnp.float32(0.0),
     )
-    expected, expected_gradient = jax.value_and_grad(loss)(learner.actor)
+    expected, expected_gradient = jax.jit(jax.value_and_grad(loss))(learner.actor)
     np.testing.assert_allclose(value, expected, rtol=1e-5)
     assert np.any(expected_gradient["head"]["kernel"])
     for a, b in zip(*map(jax.tree.leaves, (gradient, expected_gradient)), strict=True):
@@ -160,7 +163,7 @@ def test_actor_noise_averages_the_value_over_the_actions_around(problem):
 
 def test_updates_are_adam_and_polyak(problem):
     networks, learner, batch = problem
-    y = td3.target(networks, learner, batch, jax.random.key(2), _numbers())
+    y = target(networks, learner, batch, jax.random.key(2), _numbers())
 
     def both(critics):
         return sum(td3.critic_loss(critic, networks.critic, batch, y)[0] for critic in critics)
@@ -170,7 +173,7 @@ def test_updates_are_adam_and_polyak(problem):
     )
     with jax.numpy_dtype_promotion("standard"):
         adam = optax.adam(2e-2)
-        gradient = jax.grad(both)(learner.critics)
+        gradient = jax.jit(jax.grad(both))(learner.critics)
         steps, _ = adam.update(gradient, adam.init(learner.critics))
     expected = optax.apply_updates(learner.critics, steps)
     for a, b, g in zip(*map(jax.tree.leaves, (updated.critics, expected, gradient)), strict=True):
@@ -183,15 +186,15 @@ def test_updates_are_adam_and_polyak(problem):
         float(both(learner.critics)), rel=1e-6
     )
 
-    after, actor_metrics = td3.update_actor_and_targets(
+    after, actor_metrics = update_actor_and_targets(
         networks, updated, batch, jax.random.key(3), _numbers(), jnp.asarray(True)
     )
     triples = (
         (after.actor, learner.target_actor, after.target_actor),
         (updated.critics, learner.target_critics, after.target_critics),
     )
-    for online, before, target in triples:
-        for o, b, t in zip(*map(jax.tree.leaves, (online, before, target)), strict=True):
+    for online, before, moved in triples:
+        for o, b, t in zip(*map(jax.tree.leaves, (online, before, moved)), strict=True):
             np.testing.assert_allclose(t, 0.9 * np.asarray(b) + 0.1 * np.asarray(o), atol=1e-6)
     assert not np.allclose(after.actor["head"]["kernel"], learner.actor["head"]["kernel"])
 
@@ -225,7 +228,7 @@ def test_learning_rates_fall_linearly_to_their_final_fraction():
 def test_actor_noise_reaches_the_actor_alone(problem):
     networks, learner, batch = problem
     still, smoothed, again = (
-        td3.update_actor_and_targets(
+        update_actor_and_targets(
             networks,
             learner,
             batch,

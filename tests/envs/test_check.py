@@ -222,16 +222,30 @@ BROKEN = [
     (NextObservation, "final-observation", "next episode's first observation"),
     (OldObservation, "final-observation", "during an episode"),
     (HiddenLeaks, "leak", "depends on the previous one"),
-    (Unbounded, "interface", "unbounded; give its Box finite low and high"),
-    (VectorReward, "interface", "reward must be a scalar"),
-    (NoFinalObservation, "interface", "info lacks 'final_observation'"),
 ]
+REFUSED = [
+    (Unbounded, "unbounded; give its Box finite low and high"),
+    (VectorReward, "reward must be a scalar"),
+    (NoFinalObservation, "info lacks 'final_observation'"),
+]
+"""What cannot be played at all."""
 
 
 @pytest.mark.parametrize(
     ("broken", "kind", "match"), BROKEN, ids=lambda x: getattr(x, "__name__", "")
 )
 def test_what_is_broken_is_found_and_nothing_else(broken, kind, match):
+    (finding,) = find_problems(broken())
+    assert finding.kind == kind and finding.remedy
+    assert re.search(match, str(finding))
+
+
+@pytest.mark.parametrize(
+    ("broken", "match"),
+    [*REFUSED, (TimeLimitTerminates, "all 8 episodes terminate at step 8")],
+    ids=lambda x: getattr(x, "__name__", ""),
+)
+def test_an_error_is_one_line_with_the_remedy(broken, match):
     with pytest.raises(UserError, match=match) as caught:
         check_env(broken())
     message = str(caught.value)
@@ -240,13 +254,11 @@ def test_what_is_broken_is_found_and_nothing_else(broken, kind, match):
 
 
 def test_every_kind_of_finding_has_a_broken_environment():
-    kinds = {"interface", "dtype", "space", "vmap", "finite", "pure", "leak", "final-observation"}
+    kinds = {"dtype", "space", "vmap", "finite", "pure", "leak", "final-observation"}
     assert {kind for _, kind, _ in BROKEN} == kinds | {"time-limit"}
 
 
-def test_findings_name_their_kind():
-    (finding,) = find_problems(TimeLimitTerminates())
-    assert finding.kind == "time-limit" and "bootstrapped" in finding.remedy
+def test_a_finding_ends_with_its_remedy():
     assert str(Finding("pure", "this", "that")) == "this; that"
 
 

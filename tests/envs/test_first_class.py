@@ -159,8 +159,7 @@ def tank_of(best):
     return env
 
 
-def test_a_sweep_and_its_page_show_what_is_known_of_it(tank, tmp_path, monkeypatch):
-    monkeypatch.setattr(references, "EPISODES", 2)
+def test_a_sweep_and_its_page_show_what_is_known_of_it(tank, tmp_path):
     out = tmp_path / "run"
     small = "--total-steps 60 --hidden-size 8 --batch-size 8 --learning-starts 10 --eval-every 30"
     which = "--env tank --disturbances none leaky --algorithms td3 --seeds 1 --final-episodes 2"

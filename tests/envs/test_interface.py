@@ -246,4 +246,3 @@ def test_an_error_inside_is_one_line_with_its_place(where):
     broken = type("Broken", (Good,), {where if where == "action_space" else f"{where}_env": fail})
     message = refused(broken(), f"environment Broken failed in {where}: KeyError: ")
     assert "first line" in message
-    assert isinstance(message, str)

@@ -10,7 +10,7 @@ import pytest
 
 import rtd3jax as rtd
 from rtd3jax import sweep
-from rtd3jax.study import derive, finish, references, rundir
+from rtd3jax.study import finish, rundir, time_estimate
 from rtd3jax.study.contents import Contents
 from rtd3jax.study.lane_files import cell_name
 from rtd3jax.study.lock import writer
@@ -31,9 +31,7 @@ TABLES = "curves.parquet", "episodes.parquet", "metrics.parquet", "summary.md"
 @pytest.fixture(autouse=True, scope="module")
 def quick():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(references, "EPISODES", 2)
         patch.setattr(finish, "refresh_page", lambda *_, **__: None)
-        patch.setattr(derive.derive, "__kwdefaults__", {"pictures": False})
         yield
 
 
@@ -135,8 +133,9 @@ def test_what_would_change_a_finished_lane_is_refused_and_named(grown, asked, me
     assert json.loads((out / "config.json").read_text()) == kept["longer"][1]
 
 
-def test_a_dry_run_says_what_would_be_added_and_writes_nothing(grown, capsys):
+def test_a_dry_run_says_what_would_be_added_and_writes_nothing(grown, capsys, monkeypatch):
     out, kept = grown
+    monkeypatch.setattr(time_estimate, "group_seconds", lambda jobs: 1.0)
     assert run(out, "lstm-td3", 3, 120, "--dry-run", "--gamma", "0.5") == 0
     text = capsys.readouterr().out
     assert "3 cells × 3 seeds = 9 lanes" in text

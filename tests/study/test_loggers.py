@@ -93,12 +93,13 @@ def test_a_sweep_feeds_them(tmp_path, monkeypatch):
 
     monkeypatch.setitem(loggers.LOGGERS, "tensorboard", ("json", Fake))
     monkeypatch.setattr(sweep, "references_of", lambda cells: [])
-    study = "--env rover --algorithms td3 --seeds 2 --total-steps 40 --hidden-size 4 --quiet "
-    study += "--batch-size 4 --learning-starts 10 --eval-every 20 --eval-episodes 1 --no-report"
+    study = "--env rover --disturbances ar1-slip --algorithms td3 --seeds 2 --total-steps 60 "
+    study += "--hidden-size 4 --batch-size 4 --learning-starts 10 --eval-every 30 "
+    study += "--eval-episodes 1 --final-episodes 2 --quiet --no-report"
     command = [*study.split(), "--out", str(tmp_path / "run"), "--log", "tensorboard"]
     assert sweep.main(command) == 0
     assert rows.pop() == "closed"
-    assert sorted(rows) == [("td3", s, step) for s in (0, 1) for step in (20, 40)]
+    assert sorted(rows) == [("td3", s, step) for s in (0, 1) for step in (30, 60)]
 
 
 def test_what_is_not_installed_is_named(monkeypatch):

@@ -7,11 +7,11 @@ import rtd3jax as rtd
 from rtd3jax import sweep
 
 TINY = dict(
-    total_steps=40,
+    total_steps=60,
     hidden_size=4,
     batch_size=4,
     learning_starts=10,
-    eval_every=20,
+    eval_every=30,
     eval_episodes=1,
 )
 

@@ -21,7 +21,9 @@ for name in ("fcntl", "resource"):
 SWEEP = """
 import pathlib
 from rtd3jax import sweep
+from rtd3jax.study import time_estimate
 from rtd3jax.study.lock import deriver, writer
+time_estimate.group_seconds = lambda jobs: 1.0
 sweep.main("--env rover --algorithms td3 --seeds 1 --dry-run --out r".split())
 with writer(pathlib.Path(), None), deriver(pathlib.Path()):
     print("written")

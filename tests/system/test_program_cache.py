@@ -10,7 +10,7 @@ from rtd3jax.system import program_cache as programs
 from rtd3jax.training import lanes
 from rtd3jax.training.loop import make_lane, make_program
 
-SETTINGS = {"hidden_size": 4, "batch_size": 4, "learning_starts": 10, "total_steps": 30}
+SETTINGS = {"hidden_size": 4, "batch_size": 4, "learning_starts": 10, "total_steps": 60}
 SETTINGS |= {"eval_every": 30, "eval_episodes": 1}
 
 

@@ -170,10 +170,10 @@ def test_updates_come_every_so_many_steps_after_the_random_ones(update_every, cr
     )
     env = Clock()
     program = make_program(env, config, 2, (1,))
+    advance = jax.jit(program.advance)
 
     def trained(**changes):
         lane = make_lane(dataclasses.replace(config, **changes), 0, env.default_params)
-        advance = jax.jit(program.advance)
         return advance(lane, program.init(lane), jnp.int32(0), jnp.int32(20)).learner
 
     learner, smoothed = trained(), trained(actor_noise=0.5)

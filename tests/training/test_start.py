@@ -12,8 +12,7 @@ from random_policies import random_policy
 import rtd3jax as rtd
 from rtd3jax import sweep
 from rtd3jax.agents.freeze import frozen_parts
-from rtd3jax.study import finish, references
-from rtd3jax.study.derive import derive
+from rtd3jax.study import finish
 from rtd3jax.study.execute import checkpoints_of
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.starts import add_starts, starts_of
@@ -134,7 +133,7 @@ def _checkpoint_state(directory, job):
 
 def test_each_seed_goes_on_from_its_own_and_with_others_the_same(env, kept):
     run, directory = kept
-    other = rtd.make("rover", "ar1-slip")
+    other = rtd.make("rover", "sine-slip", offset=0.2)
     both = rtd.train(other, _config(), [0, 1], progress=False, start=directory)
     (alone,) = rtd.train(other, [_config()], [1], progress=False, start=directory)
     assert _same(both.policy(1), alone.policy(1)) and not _same(both.policy(0), both.policy(1))
@@ -145,7 +144,7 @@ def test_each_seed_goes_on_from_its_own_and_with_others_the_same(env, kept):
     # A Run has the policies alone; its name is part of what checkpoints are of.
     assert (
         "a policy of td3"
-        in rtd.train(other, _config(total_steps=22), [0, 1], progress=False, start=run).config.start
+        in rtd.train(other, _config(), [0, 1], progress=False, start=run).config.start
     )
 
 
@@ -265,33 +264,31 @@ FLAGS = [
 
 
 def test_a_sweep_goes_on_from_another_and_says_so(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(references, "EPISODES", 2)
     monkeypatch.setattr(finish, "refresh_page", lambda *_, **__: None)
-    monkeypatch.setattr(derive, "__kwdefaults__", {"pictures": False})
     first, second = str(tmp_path / "first"), str(tmp_path / "second")
-    trained = [*FLAGS, "--disturbances", "sine-slip", "none", "--seeds", "1"]
+    trained = [*FLAGS, "--disturbances", "ar1-slip-slow", "ar1-slip-fast", "--seeds", "1"]
     assert sweep.main([*trained, "--out", first, "--keep-checkpoints"]) == 0
     more = [*FLAGS, "--disturbances", "ar1-slip"]
     for start, seeds, message in (
-        (first, 1, f"say which disturbance: {first}@sine-slip or {first}@none"),
-        (f"{first}@sine-slip", 2, "has no seed 1 to begin from"),
+        (first, 1, f"say which disturbance: {first}@ar1-slip-slow or {first}@ar1-slip-fast"),
+        (f"{first}@ar1-slip-slow", 2, "has no seed 1 to begin from"),
         (f"{first}@ar1-slip", 1, "has no td3 under ar1-slip to begin from"),
     ):
         out = ["--out", second, "--start", start, "--seeds", str(seeds)]
         assert sweep.main([*more, *out]) == 2
         assert message in capsys.readouterr().err
     assert not (tmp_path / "second").exists()  # nothing was begun
-    begun = [*more, "--start", f"{first}@sine-slip", "--seeds", "1"]
+    begun = [*more, "--start", f"{first}@ar1-slip-slow", "--seeds", "1"]
     assert sweep.main([*begun, "--out", second, "--freeze", "actor.current"]) == 0
     summary = (tmp_path / "second" / "summary.md").read_text()
-    assert f"began from: actor, critics and optimisers of {first} rover sine-slip" in summary
-    before, after = rtd.load_policy(first, disturbance="sine-slip"), rtd.load_policy(second)
+    assert f"began from: actor, critics and optimisers of {first} rover ar1-slip-slow" in summary
+    before, after = rtd.load_policy(first, disturbance="ar1-slip-slow"), rtd.load_policy(second)
     assert _same(before.actor["current"], after.actor["current"])
     assert not _same(before.actor["head"], after.actor["head"])
     # Without checkpoints there is the actor alone.
     shutil.rmtree(tmp_path / "first" / "checkpoints")
     (cell,) = RunDirectory.open(second).cells
-    assert starts_of(cell, [0])[0].about == f"actor of {first} rover sine-slip"
+    assert starts_of(cell, [0])[0].about == f"actor of {first} rover ar1-slip-slow"
     # What is done needs its beginning no more.
     shutil.rmtree(tmp_path / "first")
     assert sweep.main([*begun, "--out", second, "--freeze", "actor.current"]) == 0

@@ -42,10 +42,10 @@ def _same(a, b):
 @pytest.mark.parametrize(
     "algorithm",
     [
-        *("td3", "lstm-td3", "lstm-td3-1ha1hc", "h-td3"),
+        *("td3", "lstm-td3-1ha1hc", "h-td3"),
         *(
-            pytest.param(f"lstm-td3-{name}", marks=pytest.mark.slow)
-            for name in ("no-action", "1ha2hc")
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("lstm-td3", "lstm-td3-no-action", "lstm-td3-1ha2hc")
         ),
     ],
 )
@@ -71,14 +71,6 @@ def test_a_seed_does_not_depend_on_its_company():
     assert _same(alone.policy(3).actor, among.policy(3).actor)
     assert not _same(among.policy(2).actor, among.policy(3).actor)
     assert len(np.unique(among.returns[:, 0])) == 5
-
-
-def test_vmap_agrees_with_map():
-    config = dataclasses.replace(TINY, total_steps=60, eval_every=30)
-    runs = [
-        rtd.train(_rover(), config, [0, 1], progress=False, strategy=s) for s in ("map", "vmap")
-    ]
-    np.testing.assert_allclose(runs[0].returns, runs[1].returns, rtol=1e-3)
 
 
 def test_a_lost_lane_is_reported_and_does_not_touch_the_others():
@@ -109,7 +101,7 @@ def test_gymnax_environments_train_without_glue(env_id):
     import gymnax
 
     env, _ = gymnax.make(env_id)
-    run = _train(env=env, total_steps=60, eval_every=60, eval_episodes=1)
+    run = _train("td3", env=env, total_steps=60, eval_every=60, eval_episodes=1)
     assert np.all(np.isfinite(run.returns))
 
 
@@ -120,7 +112,7 @@ def test_bad_seeds_are_refused(seeds):
 
 
 def test_lengths_side_by_side_equal_exact_windows():
-    """One program, two lanes of different history length; each equals its own exact program."""
+    """One program of vmapped lanes, of different history length; each equals its own of one."""
     from rtd3jax.study.plan import Cell, cell_jobs
     from rtd3jax.training.lanes import advance_groups
     from rtd3jax.training.run import collect
@@ -146,7 +138,7 @@ def test_lengths_side_by_side_equal_exact_windows():
 
 def test_several_configurations_are_trained_as_each_alone(tmp_path):
     env = rtd.make("rover", "ar1-slip")
-    tiny = dict(total_steps=40, hidden_size=4, batch_size=4, learning_starts=10, eval_every=20)
+    tiny = dict(total_steps=60, hidden_size=4, batch_size=4, learning_starts=10, eval_every=30)
     configs = [
         rtd.Config(algorithm="td3", critic_learning_rate=rate, eval_episodes=1, **tiny)
         for rate in (1e-3, 3e-2)

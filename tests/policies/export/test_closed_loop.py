@@ -1,6 +1,6 @@
 """Each exported form drives its own plant; the trained policy, seeing the same, would do the same.
 
-All agents and forms drive side by side, 5 episodes of 200 steps each.
+All agents and forms drive side by side, two episodes of 200 steps each.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from rtd3jax.agents.bounds import Bounds
 from rtd3jax.policies.export.formats import FORMATS
 
 WORLDS = {"pendulum": "random-sine", "rover": "ar1-slip"}
-EPISODES, STEPS = 5, 200
+EPISODES, STEPS = 2, 200
 TOLERANCE = 1e-5
 
 

@@ -1,5 +1,7 @@
 """Tests running carries in every export format, and the size of their state."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -57,8 +59,10 @@ def test_it_acts_as_a_window_of_the_whole_episode_in_every_form(
     np.testing.assert_array_equal(_actions(loaded, observations), _actions(policy, observations))
 
 
-@pytest.mark.parametrize("acting", ["window", "carry"])
-@pytest.mark.parametrize("agent", ["td3", "lstm-td3", "lstm-td3-1ha1hc"])
+@pytest.mark.parametrize(
+    ("agent", "acting"),
+    [("td3", "window"), *itertools.product(("lstm-td3", "lstm-td3-1ha1hc"), ("window", "carry"))],
+)
 def test_every_form_normalises_as_the_policy_does(tmp_path, env, observations, agent, acting):
     normaliser = Normaliser(jnp.float32([1e3, -2e-3]), jnp.float32([1e-2, 1e3]))
     raw = observations / np.float32([1e-2, 1e3]) + np.float32([1e3, -2e-3])
