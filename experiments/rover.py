@@ -130,18 +130,19 @@ def evaluate_policies(run: pathlib.Path, episodes: int, known: pd.DataFrame | No
     return pd.DataFrame(rows), sorted(set(missing))
 
 
+def in_the_agents_episodes(policy: PolicyLike, env: EnvironmentLike, episodes: int) -> np.ndarray:
+    """Returns of a policy in the ``episodes`` in which each seed of an agent is tested."""
+    found = [rtd.evaluate(policy, env, episodes, seed) for seed in range(SEEDS)]
+    return np.concatenate(found).astype(np.float64)
+
+
 def references(episodes: int) -> dict[str, dict[str, str]]:
     """The ceiling and the policies without training, in the episodes of the agents."""
     rows: dict[str, dict[str, str]] = {}
     nominal = rtd.make("rover", "ar1-slip")
     for tested in dict.fromkeys(tested for _, tested in COLUMNS):
         env = rtd.make("rover", tested)
-
-        def returns(policy: PolicyLike, env: EnvironmentLike = env) -> np.ndarray:
-            found = [rtd.evaluate(policy, env, episodes, seed) for seed in range(SEEDS)]
-            return np.concatenate(found).astype(np.float64)
-
-        best = returns(rtd.bayes_policy(env))
+        best = in_the_agents_episodes(rtd.bayes_policy(env), env, episodes)
         error = best.std(ddof=1) / np.sqrt(best.size)
         rows.setdefault("ceiling", {})[tested] = f"{best.mean():.3f} ± {error:.3f}"
         policies = {
@@ -150,7 +151,9 @@ def references(episodes: int) -> dict[str, dict[str, str]]:
             "uniform random": rtd.random_policy(env),
         }
         for name, policy in policies.items():
-            rows.setdefault(name, {})[tested] = f"{returns(policy).mean():.2f}"
+            rows.setdefault(name, {})[tested] = (
+                f"{in_the_agents_episodes(policy, env, episodes).mean():.2f}"
+            )
     return rows
 
 

@@ -149,6 +149,8 @@ CHANGES: tuple[dict, ...] = (
                     {},
                     {"actor_noise": 0.0, "actor_rate": 0.1},
                     {"total_steps": 20_000, "update_every": 1},
+                    # What more steps and updates still bring.
+                    {"total_steps": 160_000, "replay_capacity": 160_000},
                 )
             ),
         )

@@ -1,6 +1,7 @@
 """Runs the experiments with --quick, and tests the verdicts."""
 
 import argparse
+import re
 import shutil
 import sys
 
@@ -171,6 +172,24 @@ def test_longer_windows_of_the_rover_are_trained_once(tmp_path, capsys):
     assert experiment.main([*quick, "--run", str(tmp_path / "elsewhere")]) == 0
     assert "has 1 of 1 cells" in capsys.readouterr().out
     assert not (tmp_path / "elsewhere").exists()
+
+
+def test_longer_trainings_of_the_rover_stand_beside_those_of_its_table(tmp_path, capsys):
+    experiment = load(EXPERIMENTS / "rover_longer.py")
+    shutil.copy(EXPERIMENTS / "results" / "rover.parquet", tmp_path)
+    quick = ["--quick", "--algorithms", "td3", "--out", str(tmp_path)]
+    assert experiment.main([*quick, "--run", str(tmp_path / "run")]) == 0
+    mean = pd.read_parquet(tmp_path / "rover_longer.parquet")["mean"][0]
+    text = (tmp_path / "rover_longer.md").read_text()
+    ceiling = float(re.search(r"in the same episodes is (-\d\.\d+)\.", text)[1])
+    row = re.search(r"td3 \| (-2.916) ± 0.025 \| (.*)% \| (.*) \(1 of 5 seeds\) \| (.*)% \|", text)
+    before, below, after, further = map(float, row.groups())
+    assert after == pytest.approx(mean, abs=6e-4)
+    assert below == pytest.approx(100 * (before / ceiling - 1), abs=0.2)
+    assert further == pytest.approx(100 * (after / ceiling - 1), abs=0.2 * after / ceiling)
+    capsys.readouterr()
+    assert experiment.main([*quick, "--run", str(tmp_path / "elsewhere")]) == 0
+    assert "has 1 of 1 cells" in capsys.readouterr().out
 
 
 def test_verdicts_follow_from_the_numbers():
