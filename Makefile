@@ -20,7 +20,7 @@ sweep: venv  ## train td3, h-td3 and lstm-td3-1ha1hc on the rover: the quick pre
 bench: venv  ## measure the speed, compared with PyTorch: 20 minutes; repeat it to continue
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]' \
 		|| echo "PyTorch cannot be installed here"
-	$(BIN)/python -m experiments.benchmarks.bench --out runs/bench $(ARGS)
+	$(BIN)/python -m experiments.benchmarks.bench $(ARGS)
 
 docs: venv  ## build the site: build/site/index.html
 	$(BIN)/mkdocs build --strict --quiet

@@ -48,7 +48,6 @@ def main(arguments: list[str] | None = None) -> int:
     then |= {"actor_learning_rate": LEARNING_RATE, "critic_learning_rate": LEARNING_RATE}
     waits = {"actor_starts": ACTOR_STARTS}
     if options.quick:
-        options.run = options.out / "run"
         tiny = {"total_steps": 40, "hidden_size": 4, "batch_size": 4, "learning_starts": 8}
         tiny |= {"eval_every": 40, "eval_episodes": 1}
         first, then, waits = {**first, **tiny}, {**then, **tiny}, {"actor_starts": 16}

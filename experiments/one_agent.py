@@ -50,7 +50,7 @@ def main(arguments: list[str] | None = None) -> int:
     if options.quick:
         fields |= {"total_steps": 240, "hidden_size": 4, "learning_starts": 100, "eval_every": 240}
         fields |= {"batch_size": 10, "eval_episodes": 1}
-        options.run, options.seeds, episodes, length = options.out / "run", 1, 2, 3
+        options.seeds, episodes, length = 1, 2, 3
         conditions = CONDITIONS[0], CONDITIONS[-1]
     cells = [
         rtd.Cell(

@@ -17,7 +17,7 @@ from rtd3jax.study.memory_plan import job_bytes, lanes_at_once
 from rtd3jax.study.plan import Grid, cell_jobs, make_cells
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
+from writing import RESULTS, markdown_table, parse, provenance, write_results  # noqa: E402
 
 AGENTS = ("td3", "h-td3", "lstm-td3-1ha1hc", "lstm-td3")
 LENGTHS = (1, 10, 20)
@@ -74,7 +74,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="no effect: the script is fast")
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
-    options = parser.parse_args(arguments)
+    options = parse(parser, arguments)
     bench = RESULTS / "benchmarks" / "measurements.csv"
     rates, machine = (pd.Series(dtype=float), "none yet") if not bench.exists() else measured(bench)
     rows = rows_of(rates)

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 RESULTS = pathlib.Path(__file__).parent / "results"
-QUICK = pathlib.Path("runs/quick")
+QUICK = pathlib.Path("runs/quick_experiments")
 
 
 def parse(
@@ -23,8 +23,8 @@ def parse(
 ) -> argparse.Namespace:
     """The options. With ``--quick``, nothing is written to the directories of the full run.
 
-    Instead of the defaults of the options ``written``, a quick run has places in runs/quick. It is
-    an error to name the default of ``--out``.
+    Instead of the defaults of the options ``written``, a quick run has places in `QUICK`, or, for
+    ``--run``, in ``--out``. It is an error to name such a default, or a place in the results.
     """
     options = parser.parse_args(arguments)
     for name in written if options.quick else ():
@@ -32,10 +32,13 @@ def parse(
         if given is None:
             continue
         if given is default:
-            is_study_or_file = name == "run" or default.suffix
-            setattr(options, name, QUICK / default.name if is_study_or_file else QUICK)
-        elif name == "out" and given.resolve() == default.resolve():
-            parser.error("the results of --quick have no meaning: choose another --out")
+            within = QUICK if name == "out" else options.out
+            is_folder = name == "out" and not default.suffix
+            setattr(options, name, within if is_folder else within / default.name)
+            continue
+        place = given.resolve()
+        if place == default.resolve() or place.is_relative_to(RESULTS.resolve()):
+            parser.error(f"the results of --quick have no meaning: choose another --{name}")
     return options
 
 

@@ -333,7 +333,7 @@ def read_options(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--lengths", nargs="+", type=int, metavar="L")
     parser.add_argument("--repeats", type=int, help="rounds of each comparison [3]")
     parser.add_argument("--seconds", type=float, help="duration of each measurement [1.8]")
-    parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("runs/bench"))
     parser.add_argument("--fresh", action="store_true", help="rename earlier measurements")
     parser.add_argument("--no-torch", action="store_true", help="leave PyTorch out")
     options = parse(parser, arguments)

@@ -112,7 +112,7 @@ def test_bad_seeds_are_refused(seeds):
 
 
 def test_lengths_side_by_side_equal_exact_windows():
-    """One program of vmapped lanes, of different history length; each equals its own of one."""
+    """Vmapped lanes of different history length; each equals a program of its own."""
     from rtd3jax.study.plan import Cell, cell_jobs
     from rtd3jax.training.lanes import advance_groups
     from rtd3jax.training.run import collect
