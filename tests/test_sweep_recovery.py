@@ -170,10 +170,14 @@ def test_sigterm_leaves_checkpoints_and_the_rest_is_the_same(whole, tmp_path, mo
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-def test_an_interrupt_between_two_stages_is_one_line(number, status, tmp_path, monkeypatch, capsys, pictures):
+def test_an_interrupt_between_two_stages_is_one_line(number, status, tmp_path, monkeypatch, capsys):
     import rtd3jax.cli.sweep as stages
 
-    monkeypatch.setattr(stages, "references_of", lambda cells: os.kill(os.getpid(), number))
+    def interrupted(cells):
+        os.kill(os.getpid(), number)
+        time.sleep(10)  # another thread may receive the signal
+
+    monkeypatch.setattr(stages, "references_of", interrupted)
     assert run(tmp_path / "run") == status
     assert capsys.readouterr().err == "interrupted: repeat the command\n"
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
