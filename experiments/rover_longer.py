@@ -19,20 +19,14 @@ import numpy as np
 import pandas as pd
 
 import rtd3jax as rtd
+from rtd3jax.study.plan import Grid, make_cells
 from rtd3jax.study.presets import ROVER_HISTORY_LENGTH, ROVER_SETTINGS, ROVER_STEPS
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-from continuing import (  # noqa: E402
-    joined,
-    kept,
-    mean_and_error,
-    not_in,
-    train_missing,
-    untested_policies,
-)
+from continuing import joined, kept, not_in, train_missing  # noqa: E402
 from effects import ROVER_MARGIN, Effect  # noqa: E402
 from rover import EPISODES, SEEDS, TINY, in_the_agents_episodes  # noqa: E402
-from rover_lengths import of_the_rover  # noqa: E402
+from rover_lengths import COLUMNS, KEY, TESTED_ON, has, of_the_rover, tested  # noqa: E402
 from writing import (  # noqa: E402
     RESULTS,
     markdown_table,
@@ -44,15 +38,7 @@ from writing import (  # noqa: E402
     write_results,
 )
 
-SLIP, STEPS = "ar1-slip", 2 * ROVER_STEPS
-KEY = ["algorithm", "seed", "steps"]
-COLUMNS = [*KEY, "episodes", "mean", "standard_error"]
-
-
-def has(rows: pd.DataFrame, cell: rtd.Cell, seed: int) -> bool:
-    """Whether ``rows`` has the test of a lane."""
-    key = [cell.config.algorithm, seed, cell.config.total_steps]
-    return bool((rows[KEY] == key).all(axis=1).any())
+STEPS = 2 * ROVER_STEPS
 
 
 def table(rows: pd.DataFrame, before: pd.DataFrame, ceiling: float) -> str:
@@ -94,42 +80,28 @@ def main(arguments: list[str] | None = None) -> int:
     settings: dict[str, object] = {**ROVER_SETTINGS, "total_steps": STEPS}
     if options.quick:
         episodes, seeds, settings = 20, range(1), {**settings, **TINY, "total_steps": 60}
-    cells = [
-        rtd.Cell(
-            "rover",
-            SLIP,
-            rtd.Config(
-                algorithm=name,
-                history_length=None if name == "td3" else ROVER_HISTORY_LENGTH,
-                **settings,
-            ),
-        )
-        for name in options.algorithms
-    ]
+    grid = Grid("rover", (TESTED_ON,), tuple(options.algorithms), (ROVER_HISTORY_LENGTH,), settings)
+    cells = make_cells((grid,), {})
     rows = kept(options.out / "rover_longer.parquet", COLUMNS)
     if not options.report:
         todo = not_in(rows, cells, seeds, has)
         for line in train_missing("the table", cells, todo, seeds, options.run, options.quick):
             print(line, file=sys.stderr)
-    policies, missing = untested_policies(options.run, cells, rows, seeds, has)
-    env, found = rtd.make("rover", SLIP), []
-    for cell, seed, policy in policies:
-        returns = np.asarray(rtd.evaluate(policy, env, episodes, seed=seed), np.float64)
-        values = (cell.config.algorithm, seed, cell.config.total_steps, episodes)
-        found.append({**dict(zip(COLUMNS, values, strict=False)), **mean_and_error(returns)})
-    rows = joined(rows, found, KEY)
+    found, missing = tested(options.run, cells, rows, seeds, episodes)
+    rows = joined(rows, found, [*KEY, "steps"])
     now = rows[rows["steps"] == settings["total_steps"]]
     if now.empty:
         print(f"nothing is trained in {options.run} yet")
         return 1
     has_table = (options.out / "rover.parquet").exists()
     before = of_the_rover(options.out if has_table else RESULTS)
-    before = before[before["trained_on"] == SLIP]
+    before = before[before["trained_on"] == TESTED_ON]
+    env = rtd.make("rover", TESTED_ON)
     best = in_the_agents_episodes(rtd.bayes_policy(env), env, episodes).mean()
     text = f"{table(now, before, best)}\n\nThe ceiling in the same episodes is {best:.3f}."
     facts = provenance(
         **settings,
-        trained_and_tested_on=SLIP,
+        trained_and_tested_on=TESTED_ON,
         history_length=ROVER_HISTORY_LENGTH,
         seeds=SEEDS,
         episodes_per_seed=episodes,

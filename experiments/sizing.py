@@ -72,7 +72,7 @@ def rows_of(rates: pd.Series) -> list[dict]:
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="no effect: the script is fast")
+    parser.add_argument("--quick", action="store_true", help="not to the results")
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
     options = parse(parser, arguments)
     bench = RESULTS / "benchmarks" / "measurements.csv"
