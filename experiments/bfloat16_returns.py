@@ -24,7 +24,7 @@ from rtd3jax.study.rundir import RunDirectory
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from effects import mean_interval  # noqa: E402
 from rover import EPISODES, SEEDS  # noqa: E402
-from writing import RESULTS, markdown_table, parse, provenance, write_results  # noqa: E402
+from writing import BENCHMARKS, markdown_table, parse, provenance, write_results  # noqa: E402
 
 AGENT, DISTURBANCE = "lstm-td3-1ha1hc", "ar1-slip"
 
@@ -52,7 +52,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
     parser.add_argument("--run", type=pathlib.Path, default=pathlib.Path("runs/bfloat16"))
     parser.add_argument("--float32", type=pathlib.Path, help="a run of experiments/rover.py")
-    parser.add_argument("--out", type=pathlib.Path, default=RESULTS / "benchmarks")
+    parser.add_argument("--out", type=pathlib.Path, default=BENCHMARKS)
     options = parse(parser, arguments)
     tiny: dict[str, object] = {}
     seeds, episodes = range(SEEDS), EPISODES

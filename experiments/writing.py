@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 RESULTS = pathlib.Path(__file__).parent / "results"
+BENCHMARKS = RESULTS / "benchmarks"
 QUICK = pathlib.Path("runs/quick_experiments")
 
 

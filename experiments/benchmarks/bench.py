@@ -44,7 +44,6 @@ from rtd3jax.errors import UserError
 from rtd3jax.system.files import write_bytes_atomically
 from rtd3jax.training.lanes import workers
 
-RESULTS = pathlib.Path(__file__).parents[1] / "results" / "benchmarks"
 LENGTHS = (1, 3, 6, 10, 20)
 SEEDS = 5
 PRECISIONS = ("float32", "bfloat16")

@@ -25,7 +25,7 @@ from rtd3jax.errors import UserError
 from rtd3jax.training.lanes import workers
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
-from writing import RESULTS, markdown_table, parse  # noqa: E402
+from writing import BENCHMARKS, markdown_table, parse  # noqa: E402
 
 AGENT = products.AGENT
 
@@ -95,7 +95,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="a small run to test the script")
     parser.add_argument("--lengths", type=int, nargs="+", default=list(LENGTHS))
-    parser.add_argument("--out", type=pathlib.Path, default=RESULTS / "benchmarks")
+    parser.add_argument("--out", type=pathlib.Path, default=BENCHMARKS)
     options = parse(parser, arguments)
     sizes = QUICK if options.quick else Sizes()
     try:

@@ -20,11 +20,11 @@ import numpy as np
 import pandas as pd
 from jax import lax
 
-from experiments.benchmarks.bench import LENGTHS, RESULTS, machine
+from experiments.benchmarks.bench import LENGTHS, machine
 from rtd3jax.agents.memory import lstm
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
-from writing import markdown_table, parse, provenance, write_results  # noqa: E402
+from writing import BENCHMARKS, markdown_table, parse, provenance, write_results  # noqa: E402
 
 INPUTS = 5
 PACKAGES_OWN = lstm._activate
@@ -77,7 +77,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
     parser.add_argument("--lengths", type=int, nargs="+", default=LENGTHS)
-    parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
+    parser.add_argument("--out", type=pathlib.Path, default=BENCHMARKS)
     options = parse(parser, arguments)
     batch, width, rounds, least = (4, 8, 2, 1e-3) if options.quick else (100, 128, 11, 0.2)
     rows = []

@@ -37,9 +37,8 @@ from rtd3jax.agents.networks import init_network
 from rtd3jax.registries import AGENTS
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
-from writing import parse  # noqa: E402
+from writing import BENCHMARKS, parse  # noqa: E402
 
-RESULTS = pathlib.Path(__file__).parents[1] / "results" / "benchmarks"
 OBSERVATIONS, ACTIONS = 3, 1
 STEPS = 200
 
@@ -245,7 +244,9 @@ def _processor():
 def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="two agents, l = 2, H = 8")
-    parser.add_argument("--out", type=pathlib.Path, default=RESULTS, help="directory of latency.*")
+    parser.add_argument(
+        "--out", type=pathlib.Path, default=BENCHMARKS, help="directory of latency.*"
+    )
     options = parse(parser, arguments)
     length, width, repeats = (2, 8, 1) if options.quick else (10, 128, 100)
     agents = ("td3", "lstm-td3") if options.quick else rtd.ALGORITHMS

@@ -18,11 +18,11 @@ import sys
 import numpy as np
 import pandas as pd
 
-from experiments.benchmarks.bench import RESULTS, machine
+from experiments.benchmarks.bench import machine
 from rtd3jax.system.machine import cores
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
-from writing import markdown_table, parse, provenance, write_results  # noqa: E402
+from writing import BENCHMARKS, markdown_table, parse, provenance, write_results  # noqa: E402
 
 ROOT = pathlib.Path(__file__).parents[2]
 WORKER = """
@@ -86,7 +86,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--lengths", nargs="+", type=int, default=[1, 20])
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--seconds", type=float, default=2.0)
-    parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
+    parser.add_argument("--out", type=pathlib.Path, default=BENCHMARKS)
     options = parse(parser, arguments)
     size = 128
     if options.quick:

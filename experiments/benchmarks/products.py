@@ -28,7 +28,7 @@ from rtd3jax.study.plan import update_flops
 from rtd3jax.training.lanes import workers
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
-from writing import RESULTS, markdown_table, parse  # noqa: E402
+from writing import BENCHMARKS, markdown_table, parse  # noqa: E402
 
 AGENT = "lstm-td3-1ha1hc"
 SERIAL = {"xla_cpu_multi_thread_eigen": False}
@@ -164,7 +164,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--quick", action="store_true", help="a small run to test the script")
     parser.add_argument("--lengths", type=int, nargs="+", default=[1, 6, 20])
     parser.add_argument("--threads", type=int, default=len(workers()), help="[one per core]")
-    parser.add_argument("--out", type=pathlib.Path, default=RESULTS / "benchmarks")
+    parser.add_argument("--out", type=pathlib.Path, default=BENCHMARKS)
     options = parse(parser, arguments)
     batch, width, size, least, rounds = 100, 128, 2048, 0.3, 5
     if options.quick:

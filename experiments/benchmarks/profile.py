@@ -24,7 +24,7 @@ from rtd3jax.agents.variants import ALGORITHMS
 from rtd3jax.training.lanes import workers
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
-from writing import RESULTS, markdown_table, parse  # noqa: E402
+from writing import BENCHMARKS, markdown_table, parse  # noqa: E402
 
 PRODUCTS, OPTIMISERS, LSTM = "products", "Adam and target averages", "gates, forward and backward"
 LEARNING, ACTING = "the rest of the updates", "acting, environment, replay"
@@ -139,7 +139,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--quick", action="store_true", help="a small run to test the script")
     parser.add_argument("--agent", choices=ALGORITHMS, default="lstm-td3-1ha1hc")
     parser.add_argument("--lengths", type=int, nargs="+", default=[1, 20])
-    parser.add_argument("--out", type=pathlib.Path, default=RESULTS / "benchmarks")
+    parser.add_argument("--out", type=pathlib.Path, default=BENCHMARKS)
     options = parse(parser, arguments)
     batch, width, least, watched = (4, 8, 0.01, 0.01) if options.quick else (100, 128, 2.0, 0.5)
     texts = []

@@ -29,9 +29,8 @@ import pandas as pd
 import torch
 
 from experiments.searching import go_through
-from experiments.writing import parse
+from experiments.writing import BENCHMARKS, parse
 
-RESULTS = pathlib.Path(__file__).parents[1] / "results" / "benchmarks"
 SEEDS, STEPS, EPISODES, RANDOM_STEPS, KEEP = 3, 30_000, 100, 1_000, (0, 1)
 LIMIT = 1_000
 """The steps after which the simulator ends an episode."""
@@ -128,7 +127,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("checkout", type=pathlib.Path, help="a clone of the published code")
     parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
-    parser.add_argument("--out", type=pathlib.Path, default=RESULTS / "published_lstm_td3.csv")
+    parser.add_argument("--out", type=pathlib.Path, default=BENCHMARKS / "published_lstm_td3.csv")
     options = parse(parser, arguments)
     if not (options.checkout / "lstm_td3" / "lstm_td3_main.py").is_file():
         parser.error(f"{options.checkout} is not a clone of the published code of LSTM-TD3")

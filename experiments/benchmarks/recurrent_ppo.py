@@ -23,9 +23,8 @@ import torch
 from sb3_contrib import RecurrentPPO
 
 from experiments.searching import go_through
-from experiments.writing import parse
+from experiments.writing import BENCHMARKS, parse
 
-RESULTS = pathlib.Path(__file__).parents[1] / "results" / "benchmarks"
 SEEDS, STEPS, EPISODES, KEEP = 3, 30_000, 100, (0, 1)
 
 
@@ -72,7 +71,7 @@ def trained(seed: int, steps: int, episodes: int) -> dict[str, object]:
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
-    parser.add_argument("--out", type=pathlib.Path, default=RESULTS / "recurrent_ppo.csv")
+    parser.add_argument("--out", type=pathlib.Path, default=BENCHMARKS / "recurrent_ppo.csv")
     options = parse(parser, arguments)
     seeds, steps, episodes = (1, 128, 2) if options.quick else (SEEDS, STEPS, EPISODES)
     torch.set_num_threads(1)

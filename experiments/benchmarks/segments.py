@@ -21,13 +21,13 @@ import numpy as np
 import pandas as pd
 
 import rtd3jax as rtd
-from experiments.benchmarks.bench import RESULTS, machine
+from experiments.benchmarks.bench import machine
 from experiments.benchmarks.ours import Lanes, make_config
 from experiments.benchmarks.torch_processes import PROCESS_PER_CORE, TorchProcesses
 from rtd3jax.training.lanes import workers
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
-from writing import markdown_table, parse, provenance, write_results  # noqa: E402
+from writing import BENCHMARKS, markdown_table, parse, provenance, write_results  # noqa: E402
 
 
 def ways(segment_lengths: list[int], batch_size: int) -> dict[str, dict[str, object]]:
@@ -99,7 +99,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--batch-size", type=int, default=100)
     parser.add_argument("--width", type=int, default=128)
     parser.add_argument("--torch", action="store_true", help="also measure PyTorch's windows")
-    parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
+    parser.add_argument("--out", type=pathlib.Path, default=BENCHMARKS)
     options = parse(parser, arguments)
     if options.quick:
         options.lengths, options.segment_lengths, options.repeats = [1], [5], 1

@@ -21,12 +21,12 @@ os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"
 import pandas as pd  # noqa: E402
 
 import rtd3jax as rtd  # noqa: E402
-from experiments.benchmarks.bench import RESULTS, machine  # noqa: E402
+from experiments.benchmarks.bench import machine  # noqa: E402
 from rtd3jax.study.plan import make_cells  # noqa: E402
 from rtd3jax.study.presets import PRESETS  # noqa: E402
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
-from writing import markdown_table, parse, provenance, write_results  # noqa: E402
+from writing import BENCHMARKS, markdown_table, parse, provenance, write_results  # noqa: E402
 
 AGENT, PAPERS_BEST, SEEDS, EPISODES = "lstm-td3-1ha1hc", -1.36, 5, 20
 
@@ -35,7 +35,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
     parser.add_argument("--run", type=pathlib.Path, default=pathlib.Path("runs/time_to_return"))
-    parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
+    parser.add_argument("--out", type=pathlib.Path, default=BENCHMARKS)
     options = parse(parser, arguments)
     if (options.run / "log.jsonl").exists():
         print(f"{options.run} holds a study already: a new one must be timed", file=sys.stderr)
