@@ -25,6 +25,7 @@ from rtd3jax.evaluation.rollout import check_counts
 from rtd3jax.policies.compatibility import check_compatible, fitted
 from rtd3jax.protocols import EnvironmentLike, PolicyLike
 from rtd3jax.system.program_cache import make_room
+from rtd3jax.system.pytrees import node_types
 
 if TYPE_CHECKING:  # importing pandas takes a second
     import pandas as pd
@@ -186,12 +187,13 @@ def play_episodes(
     )
     policy = fitted(policy, own.action_shape)
     make_room()
-    frames = _play(policy, env, params, jax.random.key(seed), episodes, steps, hidden)
+    types = node_types((policy, params))
+    frames = _play(policy, env, params, jax.random.key(seed), episodes, steps, hidden, types)
     return {name: np.asarray(value) for name, value in frames.items()}
 
 
-@functools.partial(jax.jit, static_argnames=("env", "episodes", "steps", "hidden"))
-def _play(policy, env, params, key, episodes, steps, hidden):
+@functools.partial(jax.jit, static_argnames=("env", "episodes", "steps", "hidden", "types"))
+def _play(policy, env, params, key, episodes, steps, hidden, types):
     # The same keys as in `rtd3jax.evaluation.rollout`, so that the episodes are the same.
     policy_key, reset_key, step_key = jax.random.split(key, 3)
     reset_keys = jax.random.split(reset_key, episodes)

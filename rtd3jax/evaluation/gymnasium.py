@@ -1,5 +1,6 @@
 """Evaluates policies in Gymnasium's environments."""
 
+import functools
 from typing import Any
 
 import gymnasium
@@ -13,6 +14,7 @@ from rtd3jax.evaluation.rollout import check_counts
 from rtd3jax.policies.compatibility import check_compatible
 from rtd3jax.policies.trained import Policy
 from rtd3jax.protocols import PolicyLike
+from rtd3jax.system.pytrees import node_types
 
 
 def run_in_gymnasium(
@@ -51,6 +53,7 @@ def run_in_gymnasium(
 
 def _play(policy: PolicyLike, env: gymnasium.Env, episodes: int, seed: int) -> np.ndarray:
     space = _check_spaces(policy, env)
+    types = node_types(policy)
     returns = np.zeros(episodes)
     # Each episode gets its own seed, so that neighbouring values of ``seed`` share no episodes.
     for index, episode_seed in enumerate(np.random.SeedSequence(seed).generate_state(episodes)):
@@ -60,7 +63,7 @@ def _play(policy: PolicyLike, env: gymnasium.Env, episodes: int, seed: int) -> n
             where = f"at step {step} of episode {index}"
             if isinstance(policy, Policy):
                 _check_finite(where, "environment's observation", observation)
-            action, state = _act(policy, state, np.asarray(observation, np.float32))
+            action, state = _act(policy, state, np.asarray(observation, np.float32), types)
             _check_finite(where, "policy's action", action)
             action = np.clip(np.asarray(action, space.dtype), space.low, space.high)
             observation, reward, terminated, truncated, _ = env.step(action)
@@ -77,8 +80,10 @@ def _check_finite(where: str, what: str, value: ArrayLike) -> None:
         raise UserError(f"{where} the {what} is {np.asarray(value).tolist()}, which is not finite")
 
 
-@jax.jit
-def _act(policy: PolicyLike, state: object, observation: jax.Array) -> tuple[jax.Array, Any]:
+@functools.partial(jax.jit, static_argnames="types")
+def _act(
+    policy: PolicyLike, state: object, observation: jax.Array, types: tuple[type, ...]
+) -> tuple[jax.Array, Any]:
     return policy.step(state, observation)
 
 
@@ -102,7 +107,8 @@ def _check_spaces(policy: PolicyLike, env: gymnasium.Env) -> gymnasium.spaces.Bo
     seen = jax.ShapeDtypeStruct(observations.shape, np.float32)
     try:
         key = jax.eval_shape(lambda: jax.random.key(0))
-        shape = jax.eval_shape(_act, policy, jax.eval_shape(policy.init, key), seen)[0].shape
+        act = functools.partial(_act, types=node_types(policy))
+        shape = jax.eval_shape(act, policy, jax.eval_shape(policy.init, key), seen)[0].shape
     except TypeError as error:
         raise UserError(
             f"{kind} cannot be compiled; make it a flax.struct.dataclass: "

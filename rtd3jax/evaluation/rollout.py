@@ -13,6 +13,7 @@ from rtd3jax.policies.compatibility import check_compatible, fitted
 from rtd3jax.protocols import EnvironmentLike, PolicyLike
 from rtd3jax.system.numbers import is_whole
 from rtd3jax.system.program_cache import make_room
+from rtd3jax.system.pytrees import node_types
 
 
 def evaluate(
@@ -76,11 +77,12 @@ def unchecked_returns(
 ) -> tuple[jax.Array, jax.Array]:
     """As `both_returns`, without checks."""
     make_room()
-    return _episode_returns(policy, env, params, jax.random.key(seed), episodes)
+    types = node_types((policy, params))
+    return _episode_returns(policy, env, params, jax.random.key(seed), episodes, types)
 
 
-@functools.partial(jax.jit, static_argnames=("env", "episodes"))
-def _episode_returns(policy, env, params, key, episodes):
+@functools.partial(jax.jit, static_argnames=("env", "episodes", "types"))
+def _episode_returns(policy, env, params, key, episodes, types):
     return episode_returns(policy, env, params, key, episodes)
 
 

@@ -9,13 +9,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from jax.typing import ArrayLike
 
 from rtd3jax.errors import UserError
+from rtd3jax.system.pytrees import TypedNode
 
 
-class Process(struct.PyTreeNode):
+class Process(TypedNode):
     """Base of every process. A signal is a float vector, such as an observation [O]."""
 
     def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> Any:
