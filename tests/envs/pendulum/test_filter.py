@@ -69,17 +69,19 @@ def test_the_belief_is_the_posterior_of_a_million_starts(seed, steps):
 
 
 @pytest.mark.parametrize(
-    "disturbance",
+    ("disturbance", "most"),
     [
-        "hidden",
-        *(pytest.param(n, marks=pytest.mark.slow) for n in ("temporal-sine", "random-sine")),
+        ("hidden", 0.5),
+        *(pytest.param(n, 3.0, marks=pytest.mark.slow) for n in ("temporal-sine", "random-sine")),
     ],
 )
-def test_what_determines_the_state_costs_nothing(disturbance):
+def test_what_determines_the_state_costs_nothing(disturbance, most, monkeypatch):
+    monkeypatch.setattr(pendulum_filter, "ANGLES", 40)  # both returns are of the same values
+    monkeypatch.setattr(pendulum_filter, "SPEEDS", 32)
     env, plain = rtd.make("pendulum", disturbance), rtd.make("pendulum")
     returns = rtd.evaluate(rtd.filter_policy(env), env, 40)
     known = rtd.evaluate(rtd.filter_policy(plain), plain, 40)
-    assert abs(float(jnp.mean(returns - known))) < 3.0
+    assert abs(float(jnp.mean(returns - known))) < most
 
 
 def test_under_noise_it_earns_most_of_what_there_is():
