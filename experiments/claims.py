@@ -14,8 +14,12 @@ the verdict is *undecided*: there are too few seeds, or they differ too much. A 
 comparisons has the verdict of the worst comparison.
 
 The values are returns for the rover, and normalised returns of the current settings for the
-pendulum, as means over the window lengths that all sides of a comparison have. For iteration
-times, rounds of the benchmark replace seeds. The clauses of claims 5, 6, 7 and 9 on the speed and
+pendulum, as means over the window lengths that all sides of a comparison have. The trainings of a
+comparison count as independent; each window length has a variance of its own, since the seeds of
+short windows differ most. Trainings with the same seed are a little alike, at other lengths and of
+other agents: claims.json has both correlations. The first makes a mean less certain than its
+interval says, the second makes a difference more certain. For iteration times, rounds of the
+benchmark replace seeds. The clauses of claims 5, 6, 7 and 9 on the speed and
 the course of learning are not tested; the learning curves show them. Claim 11 is tested by the
 returns under each condition, which also depend on how difficult the condition is. The script
 writes claims.md and .parquet.
@@ -33,7 +37,7 @@ import pandas as pd
 import rtd3jax as rtd
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-from effects import CONFIDENCE, ROVER_MARGIN, Effect, Equal, combine  # noqa: E402
+from effects import CONFIDENCE, ROVER_MARGIN, Effect, Equal, Values, combine  # noqa: E402
 from pendulum_cells import current_setting  # noqa: E402
 from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
 
@@ -69,13 +73,15 @@ class Results:
         key = {"algorithm": algorithm, "trained_on": trained, "tested_on": tested}
         return _by_seed(self.rover, key, "mean")
 
-    def on_pendulum(self, algorithm: str, disturbance: str, lengths: Collection[int]) -> np.ndarray:
-        """Normalised return of each seed: for agents with a window, a mean over ``lengths``."""
+    def on_pendulum(
+        self, algorithm: str, disturbance: str, lengths: Collection[int]
+    ) -> list[np.ndarray]:
+        """Normalised return of each seed: for agents with a window, an array for each length."""
         key = {"algorithm": algorithm, "disturbance": disturbance}
         if self.pendulum.empty:
-            return np.empty(0)
+            return []
         known = self.pendulum["history_length"].isin([0, *lengths])
-        return _by_seed(self.pendulum[known], key, "normalised")
+        return _by_length(self.pendulum[known], key, "normalised")
 
     def lengths(self, algorithm: str, disturbance: str) -> list[int]:
         """Window lengths with which the agent was trained under the disturbance."""
@@ -84,24 +90,25 @@ class Results:
         own = _rows(self.pendulum, {"algorithm": algorithm, "disturbance": disturbance})
         return sorted(int(length) for length in own["history_length"].unique())
 
-    def compared(self, *sides: tuple[str, str]) -> tuple[str, list[np.ndarray]]:
+    def compared(self, *sides: tuple[str, str]) -> tuple[str, list[list[np.ndarray]]]:
         """The normalised returns of each agent and disturbance, with the same window lengths.
 
         While the trainings are incomplete, one side may have window lengths that another lacks.
         Only the lengths of all sides count; `td3`, which has no window, counts with each.
 
         Returns:
-            The lengths, as text for the name of the effect, and an array of seeds for each side.
+            The lengths, as text for the name of the effect, and for each side an array of seeds for
+            each length.
         """
         windows = [set(self.lengths(*side)) for side in sides if side[0] != "td3"]
         shared = sorted(set.intersection(*windows)) if windows else []
         listed = f" (l = {', '.join(map(str, shared))})" if shared else ""
         return listed, [self.on_pendulum(*side, shared) for side in sides]
 
-    def carried(self, algorithm: str, tested: str) -> np.ndarray:
-        """Normalised returns, by seed, of an agent of `random-sine` under another condition."""
+    def carried(self, algorithm: str, tested: str) -> list[np.ndarray]:
+        """Normalised returns of an agent of `random-sine` under another condition, as above."""
         key = {"algorithm": algorithm, "tested_on": tested}
-        return _by_seed(self.generalisation, key, "normalised")
+        return _by_length(self.generalisation, key, "normalised")
 
     def rates(self, algorithm: str, length: int) -> np.ndarray:
         """Seed-steps per second in each round of the benchmark."""
@@ -132,6 +139,32 @@ def _by_seed(table: pd.DataFrame, key: dict, column: str) -> np.ndarray:
     if table.empty:
         return np.empty(0)
     return _rows(table, key).groupby("seed")[column].mean().to_numpy()
+
+
+def _by_length(table: pd.DataFrame, key: dict, column: str) -> list[np.ndarray]:
+    if table.empty:
+        return []
+    rows = _rows(table, key)
+    return [own[column].to_numpy() for _, own in rows.groupby("history_length")]
+
+
+def likeness(pendulum: pd.DataFrame, across: str) -> float | None:
+    """The correlation of trainings with the same seed that differ in ``across`` alone.
+
+    What correlates is the deviation of a training from its cell's mean, in standard deviations. The
+    result is None without such pairs.
+    """
+    cell = ["algorithm", "disturbance", "history_length"]
+    if pendulum.empty:
+        return None
+    of_cells = pendulum.groupby(cell)["normalised"]
+    deviation = (pendulum["normalised"] - of_cells.transform("mean")) / of_cells.transform("std")
+    rows = pendulum[[*cell, "seed"]].assign(deviation=deviation).dropna()
+    pairs = rows.merge(rows, on=[*(name for name in cell if name != across), "seed"])
+    pairs = pairs[pairs[f"{across}_x"] != pairs[f"{across}_y"]]
+    if pairs.empty:
+        return None
+    return round(float(pairs["deviation_x"].corr(pairs["deviation_y"])), 2)
 
 
 def history_is_nothing(disturbance: str) -> Callable[[Results], list[Effect]]:
@@ -167,7 +200,7 @@ def length_helps(results: Results, disturbance: str) -> list[Effect]:
     """The longest window over the shortest."""
     lengths = results.lengths("lstm-td3", disturbance)
     if len(lengths) < 2:  # without a comparison, the claim is undecided
-        return [Effect("lstm-td3, longest over shortest window", np.empty(0), np.empty(0))]
+        return [Effect("lstm-td3, longest over shortest window", [], [])]
     long, short = (results.on_pendulum("lstm-td3", disturbance, [lengths[k]]) for k in (-1, 0))
     return [Effect(f"lstm-td3, l={lengths[-1]} over l={lengths[0]}", long, short)]
 
@@ -207,9 +240,10 @@ def one_stream(results: Results) -> list[Effect]:
     for best, agent in [*others, (one, "lstm-td3")]:
         pairs = [(name, disturbance) for name in (best, agent) for disturbance in PARTIAL]
         lengths, sides = results.compared(*pairs)
-        same = len({len(side) for side in sides}) == 1
         halves = sides[: len(PARTIAL)], sides[len(PARTIAL) :]
-        means = [np.mean(half, axis=0) if same else np.empty(0) for half in halves]
+        means: list[Values] = [
+            [seeds for side in half for seeds in side] if all(half) else [] for half in halves
+        ]
         found.append(Effect(f"{best} over {agent}{lengths}", *means))
     return found
 
@@ -373,9 +407,15 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--results", type=pathlib.Path, default=RESULTS)
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS)
     options = parser.parse_args(arguments)
-    table = judge(Results.read(options.results))
+    results = Results.read(options.results)
+    table = judge(results)
     text = markdown(table)
-    write_results(options.out, "claims", table, text, provenance(confidence=CONFIDENCE))
+    facts = provenance(
+        confidence=CONFIDENCE,
+        correlation_of_a_seed_at_two_lengths=likeness(results.pendulum, "history_length"),
+        correlation_of_a_seed_of_two_agents=likeness(results.pendulum, "algorithm"),
+    )
+    write_results(options.out, "claims", table, text, facts)
     print(text)
 
 

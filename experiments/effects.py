@@ -1,6 +1,7 @@
 """Verdicts on differences of means over seeds: each an effect, with a t interval."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from scipy import stats
@@ -16,6 +17,16 @@ each reject a difference beyond the margin exactly if the 90% interval lies with
 1987)."""
 SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "undecided"
 NO_EFFECT = "no effect"
+
+
+Values = np.ndarray | Sequence[np.ndarray]
+"""The values of seeds; or such an array for each cell of a grid, of which each has the same weight.
+The cells may have different numbers of seeds."""
+
+
+def cells_of(values: Values) -> list[np.ndarray]:
+    """The arrays of seeds, one for each cell."""
+    return [values] if isinstance(values, np.ndarray) else list(values)
 
 
 def mean_interval(values: np.ndarray, confidence: float = CONFIDENCE) -> tuple[float, float, float]:
@@ -36,25 +47,43 @@ def mean_interval(values: np.ndarray, confidence: float = CONFIDENCE) -> tuple[f
 class Effect:
     """A difference that should be positive by a claim: its name, and both sides' values by seed.
 
-    With ``paired``, both sides have the same seeds in the same order.
+    With ``paired``, both sides are one cell, with the same seeds in the same order.
     """
 
     name: str
-    better: np.ndarray
-    worse: np.ndarray
+    better: Values
+    worse: Values
     margin: float = MARGIN
     paired: bool = False
 
+    def seeds(self) -> tuple[int, int]:
+        """The fewest seeds of a cell, of each side."""
+        counts = (map(len, cells_of(side)) for side in (self.better, self.worse))
+        better, worse = (min(count, default=0) for count in counts)
+        return better, worse
+
     def interval(self, confidence: float = CONFIDENCE) -> tuple[float, float, float]:
-        """The difference of means and its interval, Welch's (1947) unless the sides are paired."""
+        """The difference of means and its interval, Welch's (1947) unless the sides are paired.
+
+        The mean of a side is that of the means of its cells. Each cell of either side has its own
+        variance, and their sum has the degrees of freedom of Welch and Satterthwaite; with one cell
+        a side, this is Welch's interval.
+        """
         if self.paired:
-            return mean_interval(self.better - self.worse, confidence)
-        difference = float(self.better.mean() - self.worse.mean())
-        if not (np.ptp(self.better) or np.ptp(self.worse)):  # without spread, Welch's is undefined
-            return difference, difference, difference
-        test = stats.ttest_ind(self.better, self.worse, equal_var=False)
-        low, high = test.confidence_interval(confidence)
-        return difference, float(low), float(high)
+            (better,), (worse,) = cells_of(self.better), cells_of(self.worse)
+            return mean_interval(better - worse, confidence)
+        sides = (1.0, cells_of(self.better)), (-1.0, cells_of(self.worse))
+        cells = [(sign / len(side), cell) for sign, side in sides for cell in side]
+        mean = float(sum(weight * cell.mean() for weight, cell in cells))
+        parts = np.array([weight**2 * cell.var(ddof=1) / len(cell) for weight, cell in cells])
+        variance = parts.sum()
+        if not variance:
+            return mean, mean, mean
+        freedom = variance**2 / sum(
+            part**2 / (len(cell) - 1) for part, (_, cell) in zip(parts, cells, strict=True)
+        )
+        half = float(stats.t.ppf(0.5 + 0.5 * confidence, freedom) * np.sqrt(variance))
+        return mean, mean - half, mean + half
 
     def bound(self) -> float:
         """The smallest margin within which the two one-sided tests find no difference."""
@@ -63,7 +92,7 @@ class Effect:
 
     def verdict(self) -> str:
         """Supported, contradicted, no effect or undecided."""
-        if min(len(self.better), len(self.worse)) < FEWEST_SEEDS:
+        if min(self.seeds()) < FEWEST_SEEDS:
             return UNDECIDED
         _, low, high = self.interval()
         if low > 0 or high < 0:
@@ -72,8 +101,9 @@ class Effect:
 
     def text(self) -> str:
         """The numbers of the effect, for the table."""
-        if min(len(self.better), len(self.worse)) < FEWEST_SEEDS:
-            return f"{self.name}: too few seeds ({len(self.better)}, {len(self.worse)})"
+        if min(self.seeds()) < FEWEST_SEEDS:
+            better, worse = self.seeds()
+            return f"{self.name}: too few seeds ({better}, {worse})"
         mean, low, high = self.interval()
         none = f", no effect beyond ±{self.bound():.3f}" if low <= 0 <= high else ""
         return f"{self.name}: {mean:+.3f} [{low:+.3f}, {high:+.3f}]{none}"
@@ -93,7 +123,7 @@ class Equal(Effect):
 
     def verdict(self) -> str:
         """Supported if the tests find no difference beyond the margin, contradicted if it is."""
-        if min(len(self.better), len(self.worse)) < FEWEST_SEEDS:
+        if min(self.seeds()) < FEWEST_SEEDS:
             return UNDECIDED
         if self.bound() <= self.margin:
             return SUPPORTED

@@ -2,16 +2,17 @@
 
 Usage: python experiments/pendulum.py [--quick] [--run DIR] [--out DIR] [--steps N] [--seeds N]
                                       [--lengths L ...] [--width H] [--disturbances D ...]
-                                      [--algorithms A ...] [--report]
+                                      [--algorithms A ...] [--first-seed S] [--report]
 
 The script trains the cells of experiments/pendulum_cells.py that are not in the table yet, as a
 study in DIR. If you repeat the command, also with another DIR, it only trains what is missing from
-the table. Then it tests each agent under its own disturbance, and the agents of `random-sine` under
-five other conditions, in 1,000 episodes each. It writes pendulum.md and .parquet, generalisation.md
-and .parquet, pendulum_curves.parquet, and the pictures of experiments/pendulum_figures.py. The
-paper has five seeds, lengths 1 to 20 and width 128; the table states what was run. `--report` does
-not train: it reads all run directories in DIR, also incomplete studies. Other rows of the table do
-not change; rows of earlier settings are marked.
+the table; with --first-seed 5, further seeds join those of the table. Then it tests each agent
+under its own disturbance, and the agents of `random-sine` under five other conditions, in 1,000
+episodes each. It writes pendulum.md and .parquet, generalisation.md and .parquet,
+pendulum_curves.parquet, and the pictures of experiments/pendulum_figures.py. The paper has five
+seeds, lengths 1 to 20 and width 128; the table states what was run. `--report` does not train: it
+reads all run directories in DIR, also incomplete studies. Other rows of the table do not change;
+rows of earlier settings are marked.
 
 Returns are normalised: 0 is the uniform random policy, 1 is the fully observed optimum.
 """
@@ -133,13 +134,15 @@ def with_others(lanes: pd.DataFrame, path: pathlib.Path, column: str) -> pd.Data
 
 
 def of_each(lanes: pd.DataFrame, column: str) -> dict[str, str]:
-    """Values of ``column`` for each disturbance; by agent if they differ."""
+    """Values of ``column`` for each disturbance; if they differ, by agent, or agent and length."""
     found = {}
     for name, here in lanes.groupby("disturbance"):
-        agents = here.groupby(column)["algorithm"].unique()
+        differ = here.groupby("algorithm")[column].transform("nunique") > 1
+        lengths = " l=" + here["history_length"].astype(str)
+        cells = here["algorithm"] + lengths.where(differ, "")
         parts = [
-            f"{value:,}" if len(agents) == 1 else f"{value:,} ({', '.join(sorted(own))})"
-            for value, own in agents.items()
+            f"{value:,} ({', '.join(sorted(own))})" if here[column].nunique() > 1 else f"{value:,}"
+            for value, own in cells.groupby(here[column]).unique().items()
         ]
         found[name] = ", ".join(parts)
     return found
@@ -247,8 +250,9 @@ def train(options: argparse.Namespace, tiny: dict[str, object]) -> list[str]:
     if len(table) and "setting" not in table:
         table = pd.DataFrame()  # an earlier version wrote the table
     wanted = cells(options, tiny)
-    todo = missing(wanted, table, options.seeds)
-    return train_missing(path, wanted, todo, range(options.seeds), options.run, quick=bool(tiny))
+    seeds = range(options.first_seed, options.first_seed + options.seeds)
+    todo = missing(wanted, table, seeds)
+    return train_missing(path, wanted, todo, seeds, options.run, quick=bool(tiny))
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -259,7 +263,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--steps", type=int, default=presets.PENDULUM_STEPS, help="h-td3 has twice as many"
     )
-    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--seeds", type=int, default=5, metavar="N")
+    parser.add_argument("--first-seed", type=int, default=0, metavar="S", help="of the N seeds")
     parser.add_argument("--lengths", type=int, nargs="+", default=[*LENGTHS])
     parser.add_argument("--width", type=int, default=128)
     parser.add_argument("--disturbances", nargs="+", metavar="D", default=[], help="no others")

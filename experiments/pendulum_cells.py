@@ -8,6 +8,7 @@ of the actor stored.
 """
 
 import argparse
+from collections.abc import Iterable
 from typing import Any
 
 import pandas as pd
@@ -63,8 +64,8 @@ def cells(options: argparse.Namespace, tiny: dict[str, Any]) -> list[rtd.Cell]:
     return list(found.values())
 
 
-def missing(wanted: list[rtd.Cell], lanes: pd.DataFrame, seeds: int) -> list[rtd.Cell]:
-    """The cells of which the table ``lanes`` has not all seeds with the current settings."""
+def missing(wanted: list[rtd.Cell], lanes: pd.DataFrame, seeds: Iterable[int]) -> list[rtd.Cell]:
+    """The cells of which the table ``lanes`` has not all ``seeds`` with the current settings."""
 
     def stands(cell: rtd.Cell) -> bool:
         config = cell.config
@@ -76,6 +77,6 @@ def missing(wanted: list[rtd.Cell], lanes: pd.DataFrame, seeds: int) -> list[rtd
             & (lanes["steps"] == config.total_steps)
             & (lanes["width"] == config.hidden_size)
         ]
-        return set(range(seeds)) <= set(own["seed"])
+        return set(seeds) <= set(own["seed"])
 
     return [cell for cell in wanted if lanes.empty or not stands(cell)]

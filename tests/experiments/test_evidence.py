@@ -240,6 +240,56 @@ def test_intervals_are_those_of_scipy():
     assert weaker.pvalue == pytest.approx(0.05)
 
 
+def test_cells_count_equally_whatever_their_seeds():
+    """Against simulations: cells of a grid with different spreads and numbers of seeds."""
+    effects = load(EXPERIMENTS / "effects.py")
+    chance = np.random.default_rng(0)
+    cells = [(0.0, 1.0, 15), (3.0, 0.1, 5)]  # mean, standard deviation, seeds
+    other = [(1.0, 0.5, 5)]
+    found = []
+    for _ in range(2_000):
+        better, worse = (
+            [chance.normal(mean, spread, seeds) for mean, spread, seeds in side]
+            for side in (cells, other)
+        )
+        found.append(effects.Effect("", better, worse).interval())
+    middle, low, high = np.transpose(found)
+    assert middle.mean() == pytest.approx((0.0 + 3.0) / 2 - 1.0, abs=0.02)
+    assert 0.94 < np.mean((low <= 0.5) & (high >= 0.5)) < 0.965
+    effect = effects.Effect("", [np.zeros(15), np.zeros(2)], worse[0])
+    assert effect.seeds() == (2, 5) and effect.verdict() == "undecided"
+    assert effect.text() == ": too few seeds (2, 5)"
+    assert effects.Effect("", [], worse).seeds() == (0, 5)
+
+
+def test_facts_name_the_cells_with_other_numbers_of_seeds():
+    pendulum = load(EXPERIMENTS / "pendulum.py")
+    cells = [("td3", 0, 5), ("lstm-td3", 1, 15), ("lstm-td3", 6, 5), ("h-td3", 1, 5)]
+    lanes = pd.DataFrame(cells, columns=["algorithm", "history_length", "seeds"])
+    found = pendulum.of_each(lanes.assign(disturbance="noise"), "seeds")
+    assert found == {"noise": "5 (h-td3, lstm-td3 l=6, td3), 15 (lstm-td3 l=1)"}
+    equal = lanes.assign(disturbance="noise", seeds=5)
+    assert pendulum.of_each(equal, "seeds") == {"noise": "5"}
+
+
+def test_trainings_with_the_same_seed_are_compared_with_each_other():
+    claims = load(EXPERIMENTS / "claims.py")
+    chance = np.random.default_rng(0)
+    seeds, rows = chance.normal(size=200), []
+    for length, like in ((1, 1.0), (6, 1.0), (20, 0.0)):
+        values = 5 * length + like * seeds + chance.normal(0, 1.0, 200)
+        for seed, value in enumerate(values):
+            row = {"history_length": length, "seed": seed, "normalised": value}
+            rows.append({"algorithm": "lstm-td3", "disturbance": "noise", **row})
+    table = pd.DataFrame(rows)
+    near = table[table["history_length"] != 20]
+    assert claims.likeness(near, "history_length") == pytest.approx(0.5, abs=0.1)
+    far = table[table["history_length"] != 1]
+    assert claims.likeness(far, "history_length") == pytest.approx(0.0, abs=0.1)
+    assert claims.likeness(near, "algorithm") is None
+    assert claims.likeness(pd.DataFrame(), "algorithm") is None
+
+
 def test_claims_without_results_are_undecided(tmp_path, capsys):
     load(EXPERIMENTS / "claims.py").main(["--results", str(tmp_path), "--out", str(tmp_path)])
     table = pd.read_parquet(tmp_path / "claims.parquet")
@@ -260,14 +310,13 @@ def test_the_pendulums_claims_follow_from_its_tables(tmp_path):
     claims = load(EXPERIMENTS / "claims.py")
     level = {"td3": 0.2, "lstm-td3": 0.6, "lstm-td3-no-action": 0.5, "lstm-td3-1ha1hc": 0.8}
     level |= {"lstm-td3-1ha2hc": 0.7, "h-td3": 0.6}
-    chance = np.random.default_rng(0)
     lanes = [
         {
             "algorithm": agent,
             "disturbance": disturbance,
             "history_length": length,
             "seed": seed,
-            "normalised": value + chance.normal(0, 0.002) + 0.01 * (length or 0),
+            "normalised": value + 0.002 * (seed - 2) + 0.01 * length,
         }
         for agent, value in level.items()
         for disturbance in ("temporal-sine", "random-sine", "noise", "hidden")
@@ -346,6 +395,11 @@ def test_the_pendulum_experiment_runs(tmp_path, capsys, monkeypatch):
     elsewhere = tmp_path / "elsewhere"
     assert pendulum.main([*quick, "--run", str(elsewhere)]) == 1
     assert "has 1 of 1 cells" in capsys.readouterr().out and not elsewhere.exists()
+
+    # A further seed joins those of the table.
+    assert pendulum.main([*quick, "--first-seed", "1", "--run", str(tmp_path / "further")]) == 0
+    assert sorted(pd.read_parquet(out / "pendulum.parquet")["seed"]) == [0, 1]
+    capsys.readouterr()
 
     # Without a finished lane of random-sine there is nothing to carry over, and that is said.
     lanes = run / "lanes"
