@@ -169,7 +169,8 @@ def action_history(lanes: pd.DataFrame) -> Figure | None:
         _bars(axes, here, "disturbance", names, list(pair))
         axes.set_title(f"l = {length}", fontsize=10)
     panels[0].set_ylabel("normalised return")
-    panels[-1].legend(fontsize=8, loc="lower right")
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, fontsize=8, ncols=2, loc="outside upper center")
     return figure
 
 
@@ -217,6 +218,8 @@ def _bars(
     axes.set_ylim(min(0.0, axes.get_ylim()[0]), 1.08)
     labels = [name.split(":")[0] + (" σ = 1" if "sigma=1" in name else "") for name in names]
     axes.set_xticks(range(len(names)), labels, rotation=30, ha="right", fontsize=8)
+    axes.set_xlim(-0.6, len(names) - 0.4)  # also without bars of the last name
+    axes.set_axisbelow(True)
     axes.grid(axis="y", color="#E4E4E4", lw=0.6)
 
 
