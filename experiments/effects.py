@@ -19,14 +19,16 @@ SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "undecided"
 NO_EFFECT = "no effect"
 
 
-Values = np.ndarray | Sequence[np.ndarray]
-"""The values of seeds; or such an array for each cell of a grid, of which each has the same weight.
-The cells may have different numbers of seeds."""
+Values = np.ndarray | Sequence["Values"]
+"""The values of seeds; or such an array for each cell of a grid, of which each has the same weight,
+and so on. The cells may have different numbers of seeds."""
 
 
-def cells_of(values: Values) -> list[np.ndarray]:
-    """The arrays of seeds, one for each cell."""
-    return [values] if isinstance(values, np.ndarray) else list(values)
+def cells_of(values: Values, weight: float = 1.0) -> list[tuple[float, np.ndarray]]:
+    """The arrays of seeds, one for each cell, and the cells' weights; their sum is ``weight``."""
+    if isinstance(values, np.ndarray):
+        return [(weight, values)]
+    return [cell for part in values for cell in cells_of(part, weight / len(values))]
 
 
 def mean_interval(values: np.ndarray, confidence: float = CONFIDENCE) -> tuple[float, float, float]:
@@ -47,7 +49,8 @@ def mean_interval(values: np.ndarray, confidence: float = CONFIDENCE) -> tuple[f
 class Effect:
     """A difference that should be positive by a claim: its name, and both sides' values by seed.
 
-    With ``paired``, both sides are one cell, with the same seeds in the same order.
+    With ``paired``, the sides have the same cells, each with the same seeds in the same order. The
+    difference is multiplied by ``factor``.
     """
 
     name: str
@@ -55,11 +58,12 @@ class Effect:
     worse: Values
     margin: float = MARGIN
     paired: bool = False
+    factor: float = 1.0
 
     def seeds(self) -> tuple[int, int]:
         """The fewest seeds of a cell, of each side."""
-        counts = (map(len, cells_of(side)) for side in (self.better, self.worse))
-        better, worse = (min(count, default=0) for count in counts)
+        sides = (self.better, self.worse)
+        better, worse = (min((len(c) for _, c in cells_of(side)), default=0) for side in sides)
         return better, worse
 
     def interval(self, confidence: float = CONFIDENCE) -> tuple[float, float, float]:
@@ -67,13 +71,15 @@ class Effect:
 
         The mean of a side is that of the means of its cells. Each cell of either side has its own
         variance, and their sum has the degrees of freedom of Welch and Satterthwaite; with one cell
-        a side, this is Welch's interval.
+        a side, this is Welch's interval. Of paired sides, the differences within pairs count.
         """
+        better = cells_of(self.better, self.factor)
+        worse = cells_of(self.worse, self.factor)
         if self.paired:
-            (better,), (worse,) = cells_of(self.better), cells_of(self.worse)
-            return mean_interval(better - worse, confidence)
-        sides = (1.0, cells_of(self.better)), (-1.0, cells_of(self.worse))
-        cells = [(sign / len(side), cell) for sign, side in sides for cell in side]
+            pairs = zip(better, worse, strict=True)
+            cells = [(weight, values - others) for (weight, values), (_, others) in pairs]
+        else:
+            cells = [*better, *((-weight, values) for weight, values in worse)]
         mean = float(sum(weight * cell.mean() for weight, cell in cells))
         parts = np.array([weight**2 * cell.var(ddof=1) / len(cell) for weight, cell in cells])
         variance = parts.sum()

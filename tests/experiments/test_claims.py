@@ -1,0 +1,269 @@
+"""Tests the verdicts on the paper's claims: intervals, comparisons, and what the tables say."""
+
+import pathlib
+import sys
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+from test_reliability import EXPERIMENTS, load
+
+
+@pytest.fixture(autouse=True)
+def leave_the_path_alone(monkeypatch):
+    monkeypatch.setattr(sys, "path", list(sys.path))
+
+
+def test_verdicts_follow_from_the_numbers():
+    claims = load(EXPERIMENTS / "claims.py")
+    good, bad = np.array([-1.3, -1.31, -1.29]), np.array([-2.9, -3.0, -2.8])
+    wide = np.array([-1.0, -3.0, -2.0])
+    assert claims.Effect("", good, bad).verdict() == "supported"
+    assert claims.Effect("", bad, good).verdict() == "contradicted"
+    assert claims.Effect("", good, wide).verdict() == "undecided"
+    assert claims.Effect("", good[:2], bad).verdict() == "undecided"
+    level = np.array([-1.300, -1.301, -1.299])
+    assert claims.Effect("", level, level[::-1]).verdict() == "no effect"
+    assert "no effect beyond ±0.00" in claims.Effect("", level, level[::-1]).text()
+    assert claims.Effect("", level, level[::-1], margin=0.0).verdict() == "undecided"
+    assert claims.combine(["supported", "undecided", "no effect"]) == "undecided"
+    assert claims.combine(["supported", "no effect"]) == "no effect"
+    assert claims.combine(["supported", "contradicted"]) == "contradicted"
+    assert claims.combine([]) == "undecided"
+    mean, low, high = claims.Effect("", good, bad).interval()
+    assert mean == pytest.approx(1.6) and low < mean < high
+
+
+def test_intervals_cover_as_often_as_they_say():
+    """Of five normal values on each side, as often as of many; a bootstrap covers 87%."""
+    effects = load(EXPERIMENTS / "effects.py")
+    chance = np.random.default_rng(0)
+    for paired in (False, True):
+        inside = []
+        for _ in range(2_000):
+            sides = chance.normal(0, 1, 5), chance.normal(0, 1, 5)
+            _, low, high = effects.Effect("", *sides, paired=paired).interval()
+            inside.append(low <= 0 <= high)
+        # Welch's interval is a little too wide with so few values.
+        assert 0.94 < np.mean(inside) < 0.975
+
+
+def test_intervals_are_those_of_scipy():
+    effects = load(EXPERIMENTS / "effects.py")
+    one, other = np.array([0.9, 0.94, 0.92, 0.99]), np.array([0.7, 0.95, 0.8])
+    for paired, test in ((False, stats.ttest_ind), (True, stats.ttest_rel)):
+        sides = (one[:3], other) if paired else (one, other)
+        found = test(*sides, **({} if paired else {"equal_var": False}))
+        expected = found.confidence_interval(0.95)
+        assert effects.Effect("", *sides, paired=paired).interval()[1:] == pytest.approx(expected)
+    # Two one-sided tests: the bound is where the p-value of the weaker one is 5%.
+    bound = effects.Effect("", one, other).bound()
+    weaker = stats.ttest_ind(one, other + bound, equal_var=False, alternative="less")
+    assert weaker.pvalue == pytest.approx(0.05)
+
+
+def test_cells_count_equally_whatever_their_seeds():
+    """Against simulations: cells of a grid with different spreads and numbers of seeds."""
+    effects = load(EXPERIMENTS / "effects.py")
+    chance = np.random.default_rng(0)
+    cells = [(0.0, 1.0, 15), (3.0, 0.1, 5)]  # mean, standard deviation, seeds
+    other = [(1.0, 0.5, 5)]
+    found = []
+    for _ in range(2_000):
+        better, worse = (
+            [chance.normal(mean, spread, seeds) for mean, spread, seeds in side]
+            for side in (cells, other)
+        )
+        found.append(effects.Effect("", better, worse).interval())
+    middle, low, high = np.transpose(found)
+    assert middle.mean() == pytest.approx((0.0 + 3.0) / 2 - 1.0, abs=0.02)
+    assert 0.94 < np.mean((low <= 0.5) & (high >= 0.5)) < 0.965
+    effect = effects.Effect("", [np.zeros(15), np.zeros(2)], worse[0])
+    assert effect.seeds() == (2, 5) and effect.verdict() == "undecided"
+    assert effect.text() == ": too few seeds (2, 5)"
+    assert effects.Effect("", [], worse).seeds() == (0, 5)
+
+
+def test_parts_of_a_side_count_equally_whatever_their_cells():
+    effects = load(EXPERIMENTS / "effects.py")
+    two, one, three = [np.zeros(5), np.full(5, 0.4)], np.ones(3), [np.full(4, k) for k in range(3)]
+    assert [weight for weight, _ in effects.cells_of([two, one])] == [0.25, 0.25, 0.5]
+    effect = effects.Effect("", [two, one], [three, one], factor=2.0)
+    assert effect.interval() == pytest.approx((2 * (0.6 - 1.0),) * 3)
+    assert effect.seeds() == (3, 3)
+
+
+def test_paired_cells_are_compared_within_their_pairs():
+    """What both values of a pair have in common does not widen the interval."""
+    effects = load(EXPERIMENTS / "effects.py")
+    chance = np.random.default_rng(0)
+    common = [chance.normal(0, 10, seeds) for seeds in (5, 15)]
+    own = [chance.normal(1, 0.1, len(cell)) for cell in common]
+    better = [cell + more for cell, more in zip(common, own, strict=True)]
+    found = effects.Effect("", better, common, paired=True).interval()
+    assert found == pytest.approx(effects.Effect("", own, [np.zeros(5), np.zeros(15)]).interval())
+    mean, low, high = effects.Effect("", better, common).interval()
+    assert mean == pytest.approx(found[0]) and high - low > 20 * (found[2] - found[1])
+
+
+def test_trainings_with_the_same_seed_are_compared_with_each_other():
+    tables = load(EXPERIMENTS / "claim_tables.py")
+    chance = np.random.default_rng(0)
+    seeds, rows = chance.normal(size=200), []
+    for length, like in ((1, 1.0), (6, 1.0), (20, 0.0)):
+        values = 5 * length + like * seeds + chance.normal(0, 1.0, 200)
+        for seed, value in enumerate(values):
+            row = {"history_length": length, "seed": seed, "normalised": value}
+            rows.append({"algorithm": "lstm-td3", "disturbance": "noise", **row})
+    table = pd.DataFrame(rows)
+    near = table[table["history_length"] != 20]
+    assert tables.Trainings(near).likeness("history_length") == pytest.approx(0.5, abs=0.1)
+    far = table[table["history_length"] != 1]
+    assert tables.Trainings(far).likeness("history_length") == pytest.approx(0.0, abs=0.1)
+    assert tables.Trainings(near).likeness("algorithm") is None
+    assert tables.Trainings(pd.DataFrame()).likeness("algorithm") is None
+
+
+def test_claims_without_results_are_undecided(tmp_path, capsys):
+    load(EXPERIMENTS / "claims.py").main(["--results", str(tmp_path), "--out", str(tmp_path)])
+    table = pd.read_parquet(tmp_path / "claims.parquet")
+    assert len(table) == 15 and set(table["verdict"]) == {"undecided"}
+    assert capsys.readouterr().out.count("not run yet") == 15
+
+
+def test_a_claim_of_no_effect_needs_a_narrow_interval():
+    claims = load(EXPERIMENTS / "claims.py")
+    one = np.array([0.900, 0.902, 0.904])
+    assert claims.Equal("", one, one + 0.01).verdict() == "supported"
+    assert claims.Equal("", one, one + 0.2).verdict() == "contradicted"
+    assert claims.Equal("", one, np.array([0.6, 0.9, 1.2])).verdict() == "undecided"
+    assert claims.Equal("", one[:2], one).verdict() == "undecided"
+
+
+PARTIAL = ("temporal-sine", "random-sine", "noise", "hidden")
+LEVEL = {"td3": 0.2, "lstm-td3": 0.6, "lstm-td3-no-action": 0.5, "lstm-td3-1ha1hc": 0.8}
+LEVEL |= {"lstm-td3-1ha2hc": 0.7, "h-td3": 0.6}
+
+
+def pendulum_lanes() -> list[dict]:
+    """Rows of a table in which the agents have the given returns, td3 less under two conditions."""
+    return [
+        {
+            "algorithm": agent,
+            "disturbance": disturbance,
+            "history_length": length,
+            "seed": seed,
+            "normalised": value
+            + 0.002 * (seed - 2)
+            + 0.01 * length
+            - 0.1 * (agent == "td3" and disturbance in PARTIAL[2:]),
+        }
+        for agent, value in LEVEL.items()
+        for disturbance in PARTIAL
+        for length in ((0,) if agent == "td3" else (1, 6))
+        for seed in range(5)
+    ]
+
+
+def verdicts_of(tables: dict[str, list[dict]], directory: pathlib.Path) -> pd.Series:
+    """The verdict of each claim on these tables."""
+    for name, rows in tables.items():
+        pd.DataFrame(rows).to_parquet(directory / f"{name}.parquet")
+    directories = ["--results", str(directory), "--out", str(directory)]
+    load(EXPERIMENTS / "claims.py").main(directories)
+    return pd.read_parquet(directory / "claims.parquet").set_index("claim")["verdict"]
+
+
+def test_the_pendulums_claims_follow_from_its_tables(tmp_path):
+    lanes = pendulum_lanes()
+    verdicts = verdicts_of({"pendulum": lanes}, tmp_path)
+    assert list(verdicts[[3, 4, 7, 8]]) == ["supported"] * 4
+    # With and without action history are 0.1 apart, more than the margin.
+    assert verdicts[6] == "contradicted"
+    # The speed of learning follows from the curves, which are missing.
+    assert verdicts[9] == "undecided"
+    assert set(verdicts[[1, 2, 10, 11, 12]]) == {"undecided"}
+
+    # td3's disadvantage is the same under each disturbance.
+    level = [
+        {**lane, "normalised": lane["normalised"] + 0.1}
+        if lane["algorithm"] == "td3" and lane["disturbance"] in ("noise", "hidden")
+        else lane
+        for lane in lanes
+    ]
+    assert verdicts_of({"pendulum": level}, tmp_path)[7] == "no effect"
+
+
+@pytest.mark.parametrize(
+    "steps, rising, verdict",
+    [(40, -0.1, "supported"), (20, -0.1, "undecided"), (40, 0.1, "contradicted")],
+)
+def test_the_claim_on_noise_follows_from_tables_and_curves(tmp_path, steps, rising, verdict):
+    """What sigma does is not read off trainings of other lengths; a fall is one of the means."""
+    lanes = pendulum_lanes()
+    large = {"disturbance": "noise:sigma=1.0", "normalised": 0.1, "steps": steps}
+    finals = [{**lane, "steps": 40} for lane in lanes] + [{**lane, **large} for lane in lanes]
+    curves = [
+        {**lane, "step": step, "normalised": lane["normalised"] + rising * step / 30_000}
+        for lane in lanes
+        for step in range(3_000, 31_000, 3_000)
+    ]
+    assert verdicts_of({"pendulum": finals, "pendulum_curves": curves}, tmp_path)[5] == verdict
+
+
+def test_speeds_of_learning_are_means_of_common_steps(tmp_path):
+    """h-td3's curve is twice as long; a curve that ends early, and a cell of two seeds, are out."""
+    tables = load(EXPERIMENTS / "claim_tables.py")
+    ends = {("h-td3", 1): 60_000, ("lstm-td3", 1): 30_000, ("lstm-td3", 6): 27_000}
+    pd.DataFrame(
+        {
+            "algorithm": agent,
+            "disturbance": "hidden",
+            "history_length": length,
+            "seed": seed,
+            "step": step,
+            "normalised": step / 30_000 + seed,
+        }
+        for (agent, length), end in {**ends, ("td3", 0): 30_000}.items()
+        for seed in range(2 if agent == "td3" else 3)
+        for step in range(3_000, end + 1, 3_000)
+    ).to_parquet(tmp_path / "pendulum_curves.parquet")
+    results = tables.Results.read(tmp_path)
+    whole = results.during(0.0, 1.0)
+    for agent in ("h-td3", "lstm-td3"):
+        (values,) = whole.values(agent, "hidden", [1, 6])
+        assert values == pytest.approx(0.55 + np.arange(3))
+    assert whole.compared(("lstm-td3", "hidden"), ("td3", "hidden"))[1][1] == []
+    (late,) = results.during(0.8, 1.0).values("h-td3", "hidden", [1])
+    assert late == pytest.approx(0.95 + np.arange(3))
+
+
+def test_comparisons_share_their_window_lengths(tmp_path):
+    """An agent that is trained with more windows than another is compared at the common ones."""
+    claims = load(EXPERIMENTS / "claims.py")
+    returns = {("lstm-td3", 6): 0.8, ("lstm-td3", 1): 0.1, ("lstm-td3-no-action", 6): 0.7}
+    returns |= {("td3", 0): 0.2, ("lstm-td3", 20): 0.9}
+    lanes = [
+        {
+            "algorithm": agent,
+            "disturbance": "temporal-sine",
+            "history_length": length,
+            "seed": seed,
+            "normalised": value,
+        }
+        for (agent, length), value in returns.items()
+        for seed in range(5)
+    ]
+    pd.DataFrame(lanes).to_parquet(tmp_path / "pendulum.parquet")
+    results = claims.Results.read(tmp_path)
+    effects = claims.temporal_sine(results) + claims.memory_helps(results)[:2]
+    found = {effect.name: effect.interval()[0] for effect in effects if len(effect.better)}
+    assert found == pytest.approx(
+        {
+            "lstm-td3 over lstm-td3-no-action (l = 6)": 0.1,
+            "lstm-td3, l=20 over l=1": 0.8,
+            "temporal-sine: lstm-td3 over td3 (l = 1, 6, 20)": 0.6 - 0.2,
+            "temporal-sine: lstm-td3-no-action over td3 (l = 6)": 0.5,
+        }
+    )
