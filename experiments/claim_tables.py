@@ -3,15 +3,53 @@
 import dataclasses
 import pathlib
 from collections.abc import Collection
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from effects import FEWEST_SEEDS
+from effects import FEWEST_SEEDS, Effect
 from pendulum_cells import current_setting
 
 from rtd3jax.study import presets
 
 CELL = ["algorithm", "disturbance", "history_length"]
+
+
+Cells = dict[int, np.ndarray]
+"""The values of an agent under a disturbance: an array of seeds for each window length. An agent
+without a window has length 0."""
+
+
+def compare(
+    name: str,
+    better: list[Cells],
+    worse: list[Cells],
+    kind: type[Effect] = Effect,
+    lengths: Collection[int] | None = None,
+    **fields: Any,
+) -> Effect:
+    """The effect between means of cells, with the same window lengths on both sides.
+
+    While the trainings are incomplete, some cells may have window lengths that others lack. Only
+    the lengths of all count (of ``lengths``, if they are given); an agent without a window counts
+    with each. The parts of the effect are those at each length. ``fields`` are other fields of the
+    effect.
+    """
+    windows = [set(cells) for cells in (*better, *worse) if set(cells) != {0}]
+    shared = set.intersection(*windows) if windows else set()
+    shared = sorted(shared if lengths is None else shared & set(lengths))
+
+    def between(title: str, known: Collection[int], **more: Any) -> Effect:
+        sides = [
+            [[values for n, values in cells.items() if n in (0, *known)] for cells in side]
+            for side in (better, worse)
+        ]
+        complete = all(all(side) for side in sides)
+        return kind(title, *(sides if complete else ([], [])), **fields, **more)
+
+    parts = [between(f"l = {length}", [length]) for length in shared] if len(shared) > 1 else []
+    listed = f" (l = {', '.join(map(str, shared))})" if shared else ""
+    return between(f"{name}{listed}", shared, parts=tuple(parts))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,31 +61,13 @@ class Trainings:
 
     table: pd.DataFrame
 
-    def lengths(self, algorithm: str, disturbance: str) -> list[int]:
-        """Window lengths with which the agent was trained under the disturbance; 0: no window."""
-        return list(self._cells(algorithm, disturbance))
-
-    def values(
-        self, algorithm: str, disturbance: str, lengths: Collection[int]
-    ) -> list[np.ndarray]:
-        """An array of seeds for each of the lengths; one array for an agent without a window."""
-        cells = self._cells(algorithm, disturbance)
-        return [values for length, values in cells.items() if length in (0, *lengths)]
-
-    def compared(self, *sides: tuple[str, str]) -> tuple[str, list[list[np.ndarray]]]:
-        """The values of each agent and disturbance, with the same window lengths.
-
-        While the trainings are incomplete, one side may have window lengths that another lacks.
-        Only the lengths of all sides count; `td3`, which has no window, counts with each.
-
-        Returns:
-            The lengths, as text for the name of the effect, and for each side an array of seeds for
-            each length.
-        """
-        windows = [set(self.lengths(*side)) for side in sides if side[0] != "td3"]
-        shared = sorted(set.intersection(*windows)) if windows else []
-        listed = f" (l = {', '.join(map(str, shared))})" if shared else ""
-        return listed, [self.values(*side, shared) for side in sides]
+    def of(self, algorithm: str, disturbance: str) -> Cells:
+        """The cells of an agent under a disturbance; seeds are in their order."""
+        if self.table.empty:
+            return {}
+        own = _rows(self.table, {"algorithm": algorithm, "disturbance": disturbance})
+        cells = own.sort_values("seed").groupby("history_length")["normalised"]
+        return {int(n): cell.to_numpy() for n, cell in cells if len(cell) >= FEWEST_SEEDS}
 
     def likeness(self, across: str) -> float | None:
         """The correlation of trainings with the same seed that differ in ``across`` alone.
@@ -67,13 +87,6 @@ class Trainings:
             return None
         return round(float(pairs["deviation_x"].corr(pairs["deviation_y"])), 2)
 
-    def _cells(self, algorithm: str, disturbance: str) -> dict[int, np.ndarray]:
-        if self.table.empty:
-            return {}
-        own = _rows(self.table, {"algorithm": algorithm, "disturbance": disturbance})
-        cells = own.sort_values("seed").groupby("history_length")["normalised"]
-        return {int(n): cell.to_numpy() for n, cell in cells if len(cell) >= FEWEST_SEEDS}
-
 
 @dataclasses.dataclass(frozen=True)
 class Results:
@@ -84,7 +97,8 @@ class Results:
     """Final returns."""
     curves: pd.DataFrame
     """Learning curves on the pendulum."""
-    generalisation: pd.DataFrame
+    carried: Trainings
+    """Returns of agents of `random-sine` under other disturbances."""
     bench: pd.DataFrame
 
     @classmethod
@@ -97,7 +111,8 @@ class Results:
         pendulum, curves, generalisation = map(current, of_the_pendulum)
         bench = directory / "benchmarks" / "measurements.csv"
         rates = pd.read_csv(bench) if bench.exists() else pd.DataFrame()
-        return cls(rover, Trainings(pendulum), curves, generalisation, rates)
+        carried = generalisation.rename(columns={"tested_on": "disturbance"})
+        return cls(rover, Trainings(pendulum), curves, Trainings(carried), rates)
 
     def on_rover(self, algorithm: str, trained: str, tested: str = "ar1-slip") -> np.ndarray:
         """Mean return of each seed."""
@@ -119,13 +134,6 @@ class Results:
         complete = self.curves.groupby(lane)["step"].transform("max") >= presets.PENDULUM_STEPS
         part = self.curves[complete & (done > first) & (done <= last)]
         return Trainings(part.groupby(lane, as_index=False)["normalised"].mean())
-
-    def carried(self, algorithm: str, tested: str) -> list[np.ndarray]:
-        """Normalised returns of an agent of `random-sine` under another condition, by length."""
-        if self.generalisation.empty:
-            return []
-        rows = _rows(self.generalisation, {"algorithm": algorithm, "tested_on": tested})
-        return [own["normalised"].to_numpy() for _, own in rows.groupby("history_length")]
 
     def rates(self, algorithm: str, length: int) -> np.ndarray:
         """Seed-steps per second in each round of the benchmark."""
