@@ -23,6 +23,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 import rtd3jax as rtd
+from rtd3jax.study.colours import colour_of
 from rtd3jax.study.plan import Grid, make_cells
 from rtd3jax.study.presets import ROVER_HISTORY_LENGTH, ROVER_SETTINGS, ROVER_STEPS
 
@@ -141,14 +142,17 @@ def draw(rows: pd.DataFrame, ceiling: float, out: pathlib.Path) -> None:
     figure = Figure(figsize=(8.4, 3.8), layout="constrained")
     for axes, slip in zip(figure.subplots(1, len(SLIPS), sharey=True), SLIPS, strict=True):
         for k, algorithm in enumerate(WITH_WINDOW):
+            colour, shift = colour_of(algorithm), 0.1 * (k - 2)  # points of equal height stay apart
             own = {
                 n: returns_of(rows, slip, algorithm, n) for n in (ROVER_HISTORY_LENGTH, *LENGTHS)
             }
             own = {length: values for length, values in own.items() if len(values)}
             means = [values.mean() for values in own.values()]
-            axes.plot(list(own), means, "o-", color=f"C{k}", label=algorithm, markersize=4)
+            axes.plot(
+                np.add(list(own), shift), means, "o-", color=colour, label=algorithm, markersize=4
+            )
             for length, values in own.items():
-                axes.plot([length] * len(values), values, ".", color=f"C{k}", alpha=0.4)
+                axes.plot([length + shift] * len(values), values, ".", color=colour, alpha=0.4)
         td3 = returns_of(rows, slip, "td3", 0)
         if len(td3):
             axes.axhline(td3.mean(), color="#777777", linestyle="--", label="td3 (no window)")
@@ -156,6 +160,7 @@ def draw(rows: pd.DataFrame, ceiling: float, out: pathlib.Path) -> None:
         axes.set_title(f"trained on {slip}, tested on {TESTED_ON}")
         axes.set_xlabel("window length l")
         axes.set_xticks([ROVER_HISTORY_LENGTH, *LENGTHS])
+        axes.set_xlim(0.5, max(LENGTHS) + 0.5)
         axes.grid(alpha=0.3)
     figure.axes[0].set_ylabel("return (higher is better)")
     handles, labels = figure.axes[0].get_legend_handles_labels()
