@@ -290,9 +290,9 @@ class Config:
                     stacklevel=4,
                 )
             resolved["segment_length"] = 0
-        elif self.segment_length is None and isinstance(self.batch_size, int):
+        elif self.segment_length is None and (batch := _as_number(self.batch_size, True)):
             divisors = range(1, DEFAULT_SEGMENT_LENGTH + 1)
-            resolved["segment_length"] = max(m for m in divisors if self.batch_size % m == 0)
+            resolved["segment_length"] = max(m for m in divisors if batch % m == 0)
         for name, value in resolved.items():
             object.__setattr__(self, name, value)
 

@@ -19,6 +19,7 @@ from rtd3jax.envs.interface import (
     DEFAULT_STEP_LIMIT,
     Interface,
     Survey,
+    changes_of_type,
     environment_name,
     foreign_code,
     survey,
@@ -125,23 +126,9 @@ def _dtypes(found: Survey) -> Iterator[Finding]:
     """Finds arrays whose type changes between reset and step."""
     assert found.reset is not None and found.step is not None
     before, after = found.reset, found.step[:2]
-    remedy = "loops and automatic resets need equal types: convert in both, e.g. jnp.float32(...)"
-    pairs: Any = zip(("observation", "state"), before, after, strict=True)
-    for what, one, other in pairs:
-        structures: list[Any] = [jax.tree.structure(one), jax.tree.structure(other)]
-        if structures[0] != structures[1]:
-            problem = f"reset and step return a {what} of different structure"
-            yield Finding("dtype", problem, "return the same dataclass from both")
-            continue
-        leaves = jax.tree_util.tree_leaves_with_path(one)
-        for (path, leaf), new in zip(leaves, jax.tree.leaves(other), strict=True):
-            if (leaf.dtype, leaf.shape) != (new.dtype, new.shape):
-                where = f"{what}{jax.tree_util.keystr(path)}"
-                problem = (
-                    f"{where} is {leaf.dtype}{list(leaf.shape)} after reset and "
-                    f"{new.dtype}{list(new.shape)} after step"
-                )
-                yield Finding("dtype", problem, remedy)
+    for what, one, other in zip(("observation", "state"), before, after, strict=True):
+        for problem, remedy in changes_of_type(what, one, other):
+            yield Finding("dtype", problem, remedy)
 
 
 def _spaces(env: EnvironmentLike, params: object, found: Survey) -> Iterator[Finding]:
@@ -236,7 +223,7 @@ def _episodes(
             )
             last_action = jnp.where(ended, last_action, action)
             seen, state, reward, terminated, truncated, info = env.step(key, state, action, params)
-            terminated, truncated = terminated.astype(bool), truncated.astype(bool)
+            terminated, truncated = jnp.asarray(terminated, bool), jnp.asarray(truncated, bool)
             out = (seen, info["final_observation"], reward, terminated, truncated)
             return (state, last_state, last_action, ended | terminated | truncated), out
 
@@ -400,7 +387,7 @@ def _leaks(env: EnvironmentLike, params: object, record: _Record, seed: int) -> 
             return state, (seen, reward)
 
         played: Any = jax.lax.scan(step, state, jax.random.split(key, AFTER_RESET))
-        return terminated.astype(bool) | truncated.astype(bool), first, *played[1]
+        return jnp.asarray(terminated, bool) | jnp.asarray(truncated, bool), first, *played[1]
 
     both = jax.tree.map(lambda leaf: leaf[pairs], (record.last_state, record.last_action))
     done, *new = jax.jit(jax.vmap(go_on, in_axes=(0, 0, None)))(*both, params)

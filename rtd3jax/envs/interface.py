@@ -69,8 +69,35 @@ def describe(env: EnvironmentLike, params: object) -> Interface:
     found = survey(env, params)
     if found.problems:
         raise found.problems[0]
-    assert found.interface is not None
+    assert found.reset is not None and found.step is not None and found.interface is not None
+    for problem, remedy in changes_of_type("state", found.reset[1], found.step[1]):
+        raise UserError(f"environment {environment_name(env)}: {problem}; {remedy}")
     return found.interface
+
+
+def changes_of_type(what: str, before: Any, after: Any) -> Iterator[tuple[str, str]]:
+    """Differences in type between the values of reset and step, each with its remedy.
+
+    Args:
+        what: the name of the value in the text.
+        before: shapes of the value that reset returns.
+        after: shapes of the value that step returns.
+    """
+    structures: list[Any] = [jax.tree.structure(before), jax.tree.structure(after)]
+    if structures[0] != structures[1]:
+        problem = f"reset and step return a {what} of different structure"
+        yield problem, "return the same dataclass from both"
+        return
+    leaves = jax.tree_util.tree_leaves_with_path(before)
+    for (path, leaf), new in zip(leaves, jax.tree.leaves(after), strict=True):
+        if (leaf.dtype, leaf.shape) != (new.dtype, new.shape):
+            where = f"{what}{jax.tree_util.keystr(path)}"
+            yield (
+                f"{where} is {leaf.dtype}{list(leaf.shape)} after reset and "
+                f"{new.dtype}{list(new.shape)} after step",
+                "loops and automatic resets need equal types: convert in both, "
+                "e.g. jnp.float32(...)",
+            )
 
 
 def survey(env: EnvironmentLike, params: object) -> Survey:
@@ -78,6 +105,7 @@ def survey(env: EnvironmentLike, params: object) -> Survey:
     name = environment_name(env)
     try:
         check_gymnax(env)
+        check_hashable(env)
     except UserError as error:
         return Survey(None, [error], None, None)
     problems: list[UserError] = []
@@ -107,6 +135,17 @@ def survey(env: EnvironmentLike, params: object) -> Survey:
     size = first[0].shape[0]
     truth = _true_observation_size(env, after[5])
     return Survey(Interface(size, shape, low.size, low, high, truth), problems, first, after)
+
+
+def check_hashable(env: object) -> None:
+    """Raise UserError unless compiled programs can be kept for ``env``."""
+    try:
+        hash(env)
+    except TypeError as error:
+        raise UserError(
+            f"environment {environment_name(env)} cannot be hashed ({error}): make it a "
+            "@dataclass(frozen=True), or @dataclass(eq=False), or inherit from rtd.ValueIdentity"
+        ) from error
 
 
 def _true_observation_size(env: object, info: object) -> int:

@@ -217,10 +217,10 @@ def _play(policy, env, params, key, episodes, steps, hidden, types):
         frame = {
             "seen": seen,
             "action": action.reshape(episodes, -1).astype(jnp.float32),
-            "reward": reward.astype(jnp.float32),
+            "reward": jnp.asarray(reward, jnp.float32),
             "true_reward": jnp.asarray(info.get("true_reward", reward), jnp.float32),
-            "terminated": terminated.astype(bool),
-            "truncated": truncated.astype(bool),
+            "terminated": jnp.asarray(terminated, bool),
+            "truncated": jnp.asarray(truncated, bool),
         }
         if "true_observation" in info:
             frame["true"] = jnp.asarray(info["true_observation"], jnp.float32)

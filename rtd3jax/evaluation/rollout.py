@@ -114,11 +114,11 @@ def episode_returns(
             observation, env_state, reward, terminated, truncated, info = jax.vmap(
                 env.step, in_axes=(0, 0, 0, None)
             )(keys, env_state, action, params)
-        reward = reward.astype(jnp.float32)
-        true = info.get("true_reward", reward).astype(jnp.float32)
+        reward = jnp.asarray(reward, jnp.float32)  # or a Python number, if it is constant
+        true = jnp.asarray(info.get("true_reward", reward), jnp.float32)
         total = total + jnp.where(alive, reward, 0.0)
         true_total = true_total + jnp.where(alive, true, 0.0)
-        alive = alive & ~(terminated.astype(bool) | truncated.astype(bool))
+        alive = alive & ~(jnp.asarray(terminated, bool) | jnp.asarray(truncated, bool))
         observation = observation.astype(jnp.float32)
         return (
             time + jnp.int32(1),

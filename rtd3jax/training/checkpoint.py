@@ -9,7 +9,9 @@ by this number. Otherwise it differs by rounding.
 """
 
 import hashlib
+import json
 import re
+import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping
@@ -86,26 +88,49 @@ class Checkpoints:
     ) -> None:
         """Write a checkpoint of each lane at ``step``; then remove all but the last ``kept``."""
         began = time.monotonic()
+        errors = []
         for job, state in jobs:
-            directory = self._directory_of(job)
-            metadata = {
-                "format": _FORMAT,
-                "step": step,
-                "identity": self._identity_of(job),
-                "versions": versions(),
-            }
             try:
-                directory.mkdir(parents=True, exist_ok=True)
-                write_arrays(directory / f"step-{step:09d}.safetensors", to_arrays(state), metadata)
-            except OSError as error:
-                raise UserError(
-                    f"checkpoint in {directory} cannot be written: {error.strerror}; "
-                    "the previous checkpoint is kept"
-                ) from error
-            for old in [*checkpoint_files(directory)[kept:], *_unfinished(directory)]:
-                old.unlink(missing_ok=True)
+                self._write(job, state, step, kept)
+            except UserError as error:  # the other lanes are written all the same
+                errors.append(error)
+        if errors:
+            raise errors[0]
         self.note(group, step)
         self._cost[id(group)] = time.monotonic() - began
+
+    def _write(self, job: Any, state: LaneState, step: int, kept: int) -> None:
+        directory = self._directory_of(job)
+        metadata = {
+            "format": _FORMAT,
+            "step": step,
+            "identity": self._identity_of(job),
+            "versions": versions(),
+        }
+        file = directory / f"step-{step:09d}.safetensors"
+        before = [old for old in checkpoint_files(directory) if old != file]
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+            write_arrays(file, to_arrays(state), metadata)
+        except OSError as error:
+            remark = "; the previous checkpoint is kept" if before else ""
+            raise _unwritable(directory, error, remark) from error
+        # Files of later steps are from before a lane started over: those would never be continued.
+        earlier = [old for old in before if (_step(old) or 0) < step]
+        stale = [old for old in before if old not in earlier[: kept - 1]]
+        for old in [*stale, *_unfinished(directory)]:
+            old.unlink(missing_ok=True)
+
+    def prepare(self, jobs: Iterable[Any]) -> None:
+        """Make the directory of each lane, and raise UserError if it cannot be written."""
+        for job in jobs:
+            directory = self._directory_of(job)
+            try:
+                directory.mkdir(parents=True, exist_ok=True)
+                with tempfile.TemporaryFile(dir=directory):
+                    pass
+            except OSError as error:
+                raise _unwritable(directory, error) from error
 
     def note(self, group: Any, step: int) -> None:
         """Note that each lane of ``group`` has a checkpoint at ``step``."""
@@ -115,6 +140,17 @@ class Checkpoints:
         """Write a checkpoint of each lane of ``group``, unless its last one is at this step."""
         if self._written.get(id(group), (0.0, None))[1] != group.step:
             self.save(group.lanes(), group, group.step)
+
+    def save_all(self, groups: Iterable[Any]) -> None:
+        """`save_once` for each group; an error is raised after all others are written."""
+        errors = []
+        for group in groups:
+            try:
+                self.save_once(group)
+            except UserError as error:
+                errors.append(error)
+        if errors:
+            raise errors[0]
 
     def restore(self, jobs: list[Any]) -> tuple[list[LaneState], int] | None:
         """The states at the newest step with a valid checkpoint of every lane, and this step.
@@ -139,9 +175,9 @@ class Checkpoints:
         step = max(common)
         return [steps[step] for steps in found], step
 
-    def newest(self, job: Any) -> int:
-        """The step of a lane's newest checkpoint, valid or not; 0 without a checkpoint."""
-        return max(checkpoint_steps(self._directory_of(job)), default=0)
+    def steps(self, job: Any) -> set[int]:
+        """The steps of a lane's checkpoints, valid or not."""
+        return set(checkpoint_steps(self._directory_of(job)))
 
     def discard(self, job: Any) -> None:
         """Remove the checkpoints of a lane that has ended and whose result is saved."""
@@ -194,7 +230,7 @@ class Checkpoints:
                 )
             del here["identity"]
         for name, value in here.items():
-            if there.get(name) != value:
+            if not same(there.get(name), value):
                 raise UserError(
                     f"{file} belongs to another {name} ({_difference(there.get(name), value)}); "
                     f"use the same {name}, or start from the beginning"
@@ -202,11 +238,20 @@ class Checkpoints:
         return longer
 
 
+def same(one: Any, other: Any) -> bool:
+    """Whether two JSON-ready values are the same; NaN is the same as NaN."""
+    return json.dumps(one, sort_keys=True) == json.dumps(other, sort_keys=True)
+
+
+def _unwritable(directory: Path, error: OSError, remark: str = "") -> UserError:
+    return UserError(f"checkpoint in {directory} cannot be written: {error.strerror}{remark}")
+
+
 def is_longer(before: Any, after: Mapping[str, Any]) -> bool:
     """Whether ``after``, the identity of a lane, equals ``before`` except for more steps."""
     if not isinstance(before, dict) or before.keys() != after.keys():
         return False
-    changed = {name for name in after if before[name] != after[name]}
+    changed = {name for name in after if not same(before[name], after[name])}
     return (
         "total_steps" in changed
         and changed <= set(LONGER)
@@ -368,6 +413,6 @@ def _step(file: Path) -> int | None:
 def _difference(there: object, here: object) -> str:
     if isinstance(there, dict) and isinstance(here, dict):
         for name in {**there, **here}:
-            if there.get(name) != here.get(name):
+            if not same(there.get(name), here.get(name)):
                 return f"{name}: {_difference(there.get(name), here.get(name))}"
     return f"{there} there, {here} here"

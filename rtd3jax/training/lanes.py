@@ -23,6 +23,7 @@ import numpy as np
 
 from rtd3jax.envs.compat.simulated import fleet_of
 from rtd3jax.envs.compat.simulator_state import simulator_handles
+from rtd3jax.system.interrupts import patient
 from rtd3jax.system.machine import cores
 from rtd3jax.system.program_cache import make_room, on_full
 from rtd3jax.training.checkpoint import Checkpoints
@@ -33,6 +34,10 @@ CHUNK_SECONDS = 1.0
 """Target wall time of a chunk: the interval of progress, and the delay after Ctrl-C."""
 
 _FIRST_CHUNK = 32
+_ENDING = (
+    "ending the current steps and writing checkpoints, which takes some seconds; another interrupt "
+    "ends the process without them"
+)
 
 
 @dataclasses.dataclass(eq=False)
@@ -140,7 +145,7 @@ def make_groups(
 ) -> list[Group]:
     """Groups of one lane (``map``), or one group per program and device (``vmap``).
 
-    With ``checkpoints``, only lanes whose checkpoints are at the same step form a group, so a new
+    With ``checkpoints``, only lanes that have checkpoints at a common step form a group, so a new
     lane does not make the others start from the beginning.
 
     ``at_once`` limits the number of lanes in memory, under ``vmap`` for each device: groups are
@@ -151,16 +156,37 @@ def make_groups(
         return [Group([job], wave=index // most) for index, job in enumerate(jobs)]
     by_program: dict[Any, list[Job]] = {}
     for job in jobs:
-        step = 0 if checkpoints is None else checkpoints.newest(job)
-        by_program.setdefault((job.program, _structure(job.lane), step), []).append(job)
+        by_program.setdefault((job.program, _structure(job.lane)), []).append(job)
+    steps_of = checkpoints.steps if checkpoints is not None else lambda job: set()
+    together = [
+        part
+        for members in by_program.values()
+        for part in with_common_steps(members, list(map(steps_of, members)))
+    ]
     shares = [
         members[start::devices]
-        for members in by_program.values()
+        for members in together
         for start in range(min(devices, len(members)))
     ]
     chunks = [share[k : k + most] for share in shares for k in range(0, len(share), most)]
     # Lanes that fit in memory alone need not fit together with lanes that wait.
     return [Group(chunk, wave=index // devices) for index, chunk in enumerate(chunks)]
+
+
+def with_common_steps(members: Sequence[Any], steps: Sequence[set[int]]) -> list[list[Any]]:
+    """Divide members into parts, so that the ``steps`` of all members of a part have one in common.
+
+    Each part has the step that most of the remaining members have in common, and of several such
+    steps the latest; the last part has the members without steps.
+    """
+    parts, new = [], [member for member, own in zip(members, steps, strict=True) if not own]
+    left = [(member, own) for member, own in zip(members, steps, strict=True) if own]
+    while left:
+        each = [step for _, own in left for step in own]
+        common = max(each, key=lambda step: (each.count(step), step))
+        parts.append([member for member, own in left if common in own])
+        left = [(member, own) for member, own in left if common not in own]
+    return [*parts, new] if new else parts
 
 
 def advance_groups(
@@ -175,6 +201,7 @@ def advance_groups(
     interrupt, the workers finish their current chunks, and the interrupt is raised again. With
     ``checkpoints``, groups continue from their checkpoints, and write new ones at intervals; at the
     end or after an interrupt, each group whose ``state`` is not None has one at its last step.
+    If a checkpoint cannot be written then, the others are written before the error is raised.
     ``devices`` has a device for each worker, by default those of `workers`.
     """
     pool = _Pool(groups)
@@ -190,15 +217,15 @@ def advance_groups(
                 for group in pool.events():
                     on_chunk(group)
             finally:
-                pool.stop()
-                for thread in threads:
-                    thread.join()
+                with patient(_ENDING):
+                    pool.stop()
+                    for thread in threads:
+                        thread.join()
     finally:
         if checkpoints is not None:
-            # A group that has ended, but is not recorded yet, still has its state.
-            for group in groups:
-                if group.state is not None and group.error is None:
-                    checkpoints.save_once(group)
+            with patient(_ENDING):
+                # A group that has ended, but is not recorded yet, still has its state.
+                checkpoints.save_all(g for g in groups if g.state is not None and g.error is None)
 
 
 @contextlib.contextmanager

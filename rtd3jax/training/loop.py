@@ -335,7 +335,8 @@ class Program:
         with foreign_code():
             if self.config.environments == 1:
                 observation, env_state, *rest = step(key, env_state, action[0])
-                return observation[None], env_state, *jax.tree.map(lambda leaf: leaf[None], rest)
+                alone = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], rest)
+                return observation[None], env_state, *alone
             keys = jax.random.split(key, self.config.environments)
             return jax.vmap(step)(keys, env_state, action)
 

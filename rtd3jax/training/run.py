@@ -2,6 +2,8 @@
 
 import dataclasses
 import hashlib
+import numbers
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, overload
@@ -176,10 +178,11 @@ def train(
         UserError: for an unsuitable environment or impossible arguments, before compilation.
     """
     single = isinstance(config, Config)
-    configs = [config] if isinstance(config, Config) else list(config)
+    configs = [config] if isinstance(config, Config) else as_list(config)
     if not configs or not all(isinstance(one, Config) for one in configs):
         raise UserError(f"config must be an rtd.Config, or several of them, not {config!r}")
     seeds = check_seeds(seeds)
+    check_checkpoints(checkpoint_dir, checkpoint_seconds)
     starts = [_starts(start if start is not None else one.start or None, seeds) for one in configs]
     configs = [
         dataclasses.replace(one, start=own[seeds[0]].where) if own else one
@@ -197,6 +200,10 @@ def train(
         checkpoints = _checkpoints(parts, configs, env, checkpoint_seconds)
     strategy, remark = check_strategy(strategy), "" if checkpoints is not None else _NO_CHECKPOINTS
     check_starts(jobs, checkpoints)
+    if checkpoints is not None:
+        checkpoints.prepare(
+            job for job in jobs if job.program.config.total_steps not in checkpoints.steps(job)
+        )
     groups = make_groups(jobs, strategy, len(workers()), checkpoints=checkpoints)
 
     def label(job: Job) -> str:
@@ -299,7 +306,7 @@ def make_jobs(
 def check_starts(jobs: Iterable[Job], checkpoints: Checkpoints | None) -> None:
     """Raise UserError if a new lane cannot start from the given networks."""
     for job in jobs:
-        if job.start is not None and not (checkpoints and checkpoints.newest(job)):
+        if job.start is not None and not (checkpoints and checkpoints.steps(job)):
             job.start.check(job.program, job.lane)
 
 
@@ -363,13 +370,35 @@ def failure_of(seed: int, state: LaneState) -> Failure | None:
 
 def check_seeds(seeds: Iterable[int]) -> tuple[int, ...]:
     """Distinct integers in 0..2**32-1, at least one."""
-    seeds = tuple(seeds)
+    listed = as_list(seeds)
+    if listed is None:
+        raise UserError(f"seeds must be a sequence of integers such as range(5), not {seeds!r}")
+    seeds = tuple(listed)
     for seed in seeds:
         if not is_whole(seed) or not 0 <= seed < 2**32:
             raise UserError(f"seeds must be integers from 0 to 2**32 - 1, not {seed!r}")
     if not seeds or len(set(seeds)) < len(seeds):
         raise UserError(f"seeds must be distinct and at least one, not {list(seeds)}")
     return tuple(int(seed) for seed in seeds)
+
+
+def as_list(values: Any) -> list[Any] | None:
+    """The values of something that can be iterated over; None for anything else."""
+    try:
+        return list(values)
+    except TypeError:
+        return None
+
+
+def check_checkpoints(directory: Any, seconds: Any) -> None:
+    """Raise UserError unless these are a path, and a time in seconds; both may be None."""
+    if not (directory is None or isinstance(directory, str | os.PathLike)):
+        raise UserError(f"checkpoint_dir must be a path, not {directory!r}")
+    if seconds is None:
+        return
+    number = isinstance(seconds, numbers.Real) and not isinstance(seconds, bool)
+    if not number or not float(seconds) >= 0:  # also NaN
+        raise UserError(f"checkpoint_seconds must be a number of at least 0, not {seconds!r}")
 
 
 def check_strategy(strategy: str | None) -> str:

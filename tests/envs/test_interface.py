@@ -1,5 +1,6 @@
 """Tests which environments `describe` accepts, and that every refusal is one clear line."""
 
+import dataclasses
 from typing import ClassVar
 
 import gymnasium
@@ -61,6 +62,27 @@ def refused(env, match):
         describe(env, env.default_params if hasattr(env, "default_params") else None)
     assert "\n" not in str(caught.value)
     return str(caught.value)
+
+
+def test_a_state_that_changes_its_type_is_refused():
+    class Changing(Good):
+        def step_env(self, key, state, action, params):
+            state = State(time=state.time + 1.0)
+            return self.observation(), state, self.reward(action), jnp.array(False), {}
+
+        def step(self, key, state, action, params=None):  # gymnax's own would convert
+            found = self.step_env(key, state, action, params)
+            return *found[:4], jnp.array(False), {"final_observation": found[0]}
+
+    refused(Changing(), r"state\.time is int32\[\] after reset and float32\[\] after step")
+
+
+def test_an_environment_that_cannot_be_hashed_is_refused_with_the_reason():
+    @dataclasses.dataclass
+    class Data(Good):
+        gain: float = 1.0
+
+    assert "frozen=True" in refused(Data(), r"cannot be hashed \(unhashable type: 'Data'\)")
 
 
 def test_a_good_environment_is_measured():

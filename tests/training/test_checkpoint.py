@@ -8,8 +8,8 @@ import pytest
 
 import rtd3jax as rtd
 from rtd3jax.system.files import read_arrays, write_arrays
-from rtd3jax.training import lanes, run
-from rtd3jax.training.checkpoint import Checkpoints
+from rtd3jax.training import checkpoint, lanes, run
+from rtd3jax.training.checkpoint import Checkpoints, checkpoint_steps
 
 CONFIG = rtd.Config(
     algorithm="h-td3",
@@ -207,10 +207,62 @@ def test_static_options_of_an_environment_identify_a_lane(first, second, differe
     assert checkpoints.restore([job]) is not None
 
 
-def test_a_directory_that_cannot_be_written_is_named(tmp_path):
+def test_a_directory_that_cannot_be_written_is_named_before_the_training(tmp_path, monkeypatch):
+    monkeypatch.setattr(lanes, "compiled", lambda *_: pytest.fail("training began"))
     (tmp_path / "file").write_text("")
-    with pytest.raises(rtd.UserError, match="cannot be written"):
+    with pytest.raises(rtd.UserError, match="cannot be written: Not a directory$"):
         _train(tmp_path / "file")
+    (tmp_path / "seed-1").write_text("")
+    with pytest.raises(rtd.UserError, match="seed-1 cannot be written: File exists$"):
+        _train(tmp_path)
+
+
+def test_a_lane_that_cannot_be_written_does_not_stop_the_others(tmp_path, monkeypatch):
+    def interrupt(_, group):
+        monkeypatch.setattr(checkpoint, "write_arrays", write_others)
+        raise KeyboardInterrupt
+
+    def write_others(file, *rest):
+        if file.parent.name == "seed-0":
+            raise OSError(28, "No space left on device")
+        write_arrays(file, *rest)
+
+    monkeypatch.setattr(lanes, "_FIRST_CHUNK", 13)
+    monkeypatch.setattr(run.Progress, "update", interrupt)
+    # As under vmap, in one group; under map, each lane is a group of its own.
+    for strategy in ("map", "vmap"):
+        with pytest.raises(rtd.UserError, match="seed-0 cannot be written: No space left"):
+            _train(tmp_path / strategy, strategy=strategy)
+        saved = {file.parent.name for file in (tmp_path / strategy).rglob("*.safetensors")}
+        assert "seed-0" not in saved and ("seed-2" in saved or strategy == "map")
+        assert "seed-1" in saved
+
+
+def test_files_of_later_steps_do_not_outlive_a_lane_that_started_over(tmp_path):
+    """Its new checkpoints would be the oldest, and be removed as soon as they are written."""
+    checkpoints = Checkpoints(lambda job: tmp_path, lambda job: {})
+    for step in (1_637, 2_000, 600, 700, 800):
+        checkpoints.save([(None, {"leaf": np.zeros(1)})], step, step)
+        newest = checkpoint_steps(tmp_path)
+        assert newest[0] == step and len(newest) <= 2
+    assert newest == [800, 700]
+
+
+def test_lanes_that_were_torn_apart_advance_together_from_a_common_step():
+    steps = {"a": {224, 284}, "b": {224, 284}, "c": {224}, "d": {224}, "new": set()}
+    steps |= {"e": {5_000, 6_000}, "f": {7_000}, "other": set()}
+    parts = lanes.with_common_steps(list(steps), list(steps.values()))
+    assert parts == [["a", "b", "c", "d"], ["f"], ["e"], ["new", "other"]]
+    assert lanes.with_common_steps([], []) == []
+    assert lanes.with_common_steps(["a", "b"], [set(), set()]) == [["a", "b"]]
+
+
+def test_nan_in_an_identity_is_the_same_nan():
+    nan = {"params": [7, float("nan")]}
+    assert checkpoint.same(nan, {"params": [7, float("nan")]})
+    assert not checkpoint.same(nan, {"params": [7, 0.0]})
+    longer = {**nan, "total_steps": 40}
+    assert checkpoint.is_longer({"params": [7, float("nan")], "total_steps": 20}, longer)
 
 
 def test_typed_keys_survive(tmp_path):
@@ -224,8 +276,6 @@ def test_typed_keys_survive(tmp_path):
 
 
 def test_large_checkpoints_wait_longer_by_default(tmp_path, monkeypatch):
-    from rtd3jax.training import checkpoint
-
     now = [0.0]
     monkeypatch.setattr(checkpoint.time, "monotonic", lambda: now[0])
     group = type("Group", (), {"step": 0})()

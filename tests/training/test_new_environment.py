@@ -53,6 +53,34 @@ def test_a_new_environment_trains_and_its_terminations_count():
     assert run.returns[0, -1] > -2.0 > float(np.mean(random))
 
 
+class Constant:
+    """An environment that only has the methods of gymnax, and whose step returns Python numbers."""
+
+    default_params = environment.EnvParams(max_steps_in_episode=5)
+
+    def reset(self, key, params=None):
+        return jax.random.uniform(key, (2,)), jnp.int32(0)
+
+    def step(self, key, state, action, params=None):
+        first, start = self.reset(key)
+        truncated = state >= 4
+        seen = jnp.where(truncated, first, jnp.zeros(2))
+        after = jnp.where(truncated, start, state + 1)
+        return seen, after, -1.0, False, truncated, {"final_observation": jnp.zeros(2)}
+
+    def action_space(self, params=None):
+        return spaces.Box(-1.0, 1.0, (1,))
+
+
+def test_rewards_and_terminations_may_be_python_numbers():
+    env = Constant()
+    rtd.check_env(env)
+    config = rtd.Config(
+        "td3", total_steps=20, learning_starts=10, batch_size=4, hidden_size=4, eval_every=20
+    )
+    assert rtd.train(env, config, [0], progress=False).returns.tolist() == [[-5.0]]
+
+
 class Broken(Cart):
     """Its sensor fails at the fifth step."""
 

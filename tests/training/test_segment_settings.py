@@ -2,6 +2,7 @@
 
 import warnings
 
+import numpy as np
 import pytest
 
 import rtd3jax as rtd
@@ -51,7 +52,9 @@ def test_a_carry_beyond_the_windows_is_warned_of():
 
 @pytest.mark.parametrize("batch_size, length", [(100, 10), (50, 10), (8, 8), (14, 7), (13, 1)])
 def test_the_default_length_divides_the_batch(batch_size, length):
-    assert rtd.Config(replay="segments", batch_size=batch_size).segment_length == length
+    for kind in (int, float, np.int64):
+        config = rtd.Config(replay="segments", batch_size=kind(batch_size))
+        assert (config.batch_size, config.segment_length) == (batch_size, length)
 
 
 def test_a_gradient_of_the_burn_in_without_a_burn_in_is_a_warning():

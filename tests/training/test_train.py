@@ -105,10 +105,31 @@ def test_gymnax_environments_train_without_glue(env_id):
     assert np.all(np.isfinite(run.returns))
 
 
-@pytest.mark.parametrize("seeds", [[], [1, 1], [-1], [0.5]])
+@pytest.mark.parametrize("seeds", [[], [1, 1], [-1], [0.5], 3, None])
 def test_bad_seeds_are_refused(seeds):
     with pytest.raises(rtd.UserError, match="seeds must be"):
         rtd.train(_rover(), TINY, seeds, progress=False)
+
+
+@pytest.mark.parametrize("config", [None, rtd.Config, 3, []])
+def test_what_is_no_configuration_is_refused(config):
+    with pytest.raises(rtd.UserError, match=r"config must be an rtd\.Config"):
+        rtd.train(_rover(), config, progress=False)
+
+
+@pytest.mark.parametrize(
+    "options, line",
+    [
+        ({"checkpoint_dir": 3}, "checkpoint_dir must be a path, not 3"),
+        ({"checkpoint_seconds": "60"}, "checkpoint_seconds must be a number of at least 0"),
+        ({"checkpoint_seconds": float("nan")}, "at least 0, not nan"),
+        ({"checkpoint_seconds": -1}, "at least 0, not -1"),
+        ({"checkpoint_seconds": True}, "at least 0, not True"),
+    ],
+)
+def test_bad_options_of_checkpoints_are_refused(options, line):
+    with pytest.raises(rtd.UserError, match=line):
+        rtd.train(_rover(), TINY, progress=False, **options)
 
 
 def test_lengths_side_by_side_equal_exact_windows():
@@ -195,7 +216,7 @@ def test_a_long_training_without_checkpoints_says_so_once(capsys, monkeypatch, t
 
 def test_side_by_side_only_lanes_of_the_same_step_advance_together():
     jobs = make_jobs(_rover(), TINY, [0, 1, 2], cell="cell")
-    steps = {0: 40, 1: 40, 2: 0}
-    kept = types.SimpleNamespace(newest=lambda job: steps[job.seed])
+    steps = {0: {20, 40}, 1: {40}, 2: set()}
+    kept = types.SimpleNamespace(steps=lambda job: steps[job.seed])
     groups = make_groups(jobs, "vmap", 1, checkpoints=kept)
     assert [[job.seed for job in group.jobs] for group in groups] == [[0, 1], [2]]
