@@ -13,7 +13,8 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from rtd3jax.envs.compat.simulated import fleet_of
-from rtd3jax.envs.compat.simulator_state import without_handles
+from rtd3jax.envs.compat.simulator import fault_of
+from rtd3jax.envs.compat.simulator_state import simulator_handles, without_handles
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import (
     DEFAULT_STEP_LIMIT,
@@ -248,6 +249,10 @@ def _draw(seed: jax.Array, low: jax.Array, high: jax.Array, steps: int) -> tuple
 
 def _finite(record: _Record) -> Iterator[Finding]:
     """Finds infinities and NaN in the episodes."""
+    faults = map(fault_of, simulator_handles(record.last_state))
+    if fault := next(filter(None, faults), None):
+        yield Finding("simulator", fault, "make reset and step as Gymnasium's Env describes them")
+        return
     remedy = "look for a division by zero, a logarithm, or a state that grows without bound"
     if not np.all(np.isfinite(record.first)):
         yield Finding("finite", "the observation of reset is not finite", remedy)

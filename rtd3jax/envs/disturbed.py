@@ -1,5 +1,6 @@
 """An environment whose observation, action or reward a process disturbs (paper, Section 5.2)."""
 
+import warnings
 from typing import Any
 
 import jax
@@ -12,7 +13,7 @@ from rtd3jax.envs.compat.resets import step_with_reset
 from rtd3jax.envs.compat.simulated import is_simulated
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.identity import ValueIdentity, strong
-from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT, describe, foreign_code
+from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT, describe, environment_name, foreign_code
 from rtd3jax.envs.processes.disturbances import Hidden
 from rtd3jax.envs.processes.mixture import Mixture
 from rtd3jax.envs.processes.process import Chain, NoDisturbance, Process
@@ -287,12 +288,7 @@ def disturb(
         )
     process.validate()
     params = parameters_of(env, params)
-    for method in ("reset_env", "step_env", "is_truncated"):
-        if not callable(getattr(env, method, None)):
-            raise UserError(
-                f"{type(env).__name__} has no {method}, without which a disturbance cannot be "
-                "composed with its episodes: inherit from gymnax's Environment"
-            )
+    check_composable(env)
     base: Any = env
     reward_from = "state"
     if isinstance(env, Disturbed):
@@ -304,7 +300,50 @@ def disturb(
     params = params.replace(**{channel: sequence(getattr(params, channel), process)})
     disturbed = Disturbed(base, reward_from, params)
     check_processes(disturbed)
+    warn_if_it_begins_too_late(disturbed)
     return disturbed
+
+
+def check_composable(env: object) -> None:
+    """Raise UserError unless disturbances can be composed with the episodes of ``env``."""
+    for method in ("reset_env", "step_env", "is_truncated"):
+        if not callable(getattr(env, method, None)):
+            raise UserError(
+                f"{type(env).__name__} has no {method}, without which a disturbance cannot be "
+                "composed with its episodes: inherit from gymnax's Environment"
+            )
+
+
+def warn_if_it_begins_too_late(env: Disturbed) -> None:
+    """Warn of processes that begin within the episode, if its time limit is not known."""
+    own = env.default_params
+    limit = getattr(own.env, "max_steps_in_episode", None)
+    if limit is not None and not (is_simulated(env.base) and limit == DEFAULT_STEP_LIMIT):
+        return
+    late = [
+        type(process).__name__
+        for channel in CHANNELS
+        for process in _members(getattr(own, channel))
+        if process.begins_later
+    ]
+    if late:
+        remedy = (
+            "pass max_steps_in_episode to rtd.from_gymnasium"
+            if is_simulated(env.base)
+            else "give the environment's parameters the field max_steps_in_episode"
+        )
+        warnings.warn(
+            f"{' and '.join(late)} would begin at any of {DEFAULT_STEP_LIMIT:,} steps, because "
+            f"{environment_name(env.base)} states no time limit: in shorter episodes it hardly "
+            f"ever acts; {remedy}",
+            stacklevel=3,
+        )
+
+
+def _members(process: Process) -> list[Process]:
+    """The processes of which a process consists."""
+    inner = getattr(process, "processes", None)
+    return [process] if inner is None else [one for part in inner for one in _members(part)]
 
 
 def sequence(*processes: Process) -> Process:

@@ -1,8 +1,10 @@
 """Checks of an environment that a caller passes, and its parameters."""
 
+import dataclasses
 from typing import Any
 
 import gymnasium
+import jax
 
 from rtd3jax.envs.processes.process import check_uses
 from rtd3jax.errors import UserError
@@ -38,10 +40,26 @@ def parameters_of(env: EnvironmentLike, params: object = None) -> Any:
     return params
 
 
+def _check_kind(env: Any, params: object) -> None:
+    """Raise UserError for parameters of the plant inside of ``env``, or that JAX cannot trace."""
+    own = getattr(env, "default_params", None)
+    if hasattr(env, "base") and hasattr(own, "env") and not hasattr(params, "env"):
+        raise UserError(
+            f"params are a {type(params).__name__}, but the environment is disturbed: pass "
+            "params=env.default_params.replace(env=...)"
+        )
+    if dataclasses.is_dataclass(params) and jax.tree_util.all_leaves([params]):
+        raise UserError(
+            f"params are a {type(params).__name__}, a dataclass that JAX does not know: decorate "
+            "it with flax.struct.dataclass"
+        )
+
+
 def own_parameters(env: EnvironmentLike, params: object = None) -> Any:
     """As `parameters_of`, without the checks of disturbances and of JAX's switches."""
     check_gymnax(env)
     if params is not None:
+        _check_kind(env, params)
         return params
     try:
         return env.default_params

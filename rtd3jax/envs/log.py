@@ -78,7 +78,13 @@ def _read_table(path: str | os.PathLike) -> "pd.DataFrame":
     try:
         if file.is_file() and file.stat().st_size == 0:
             raise UserError(f"{path} is empty: it needs a line of column names and rows of numbers")
-        return read(file)
+        table = read(file)
+        if read is pd.read_csv and not isinstance(table.index, pd.RangeIndex):
+            raise UserError(
+                f"{path} has rows with more cells than its line of column names (a comma at the "
+                "end of the rows, or commas as decimal signs?): write as many cells in each"
+            )
+        return table
     except UserError:
         raise
     except OSError as error:

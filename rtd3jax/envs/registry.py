@@ -19,9 +19,11 @@ from rtd3jax.envs.disturbed import (
     CHANNELS,
     Disturbed,
     DisturbedParams,
+    check_composable,
     check_processes,
     disturb,
     sequence,
+    warn_if_it_begins_too_late,
 )
 from rtd3jax.envs.entry import check_gymnax, own_parameters
 from rtd3jax.envs.interface import describe
@@ -184,6 +186,12 @@ def register(
         _entries[env_id] = _Entry(None, cast("Callable[..., Any]", env), {}, module)
         return
     check_gymnax(env)
+    if isinstance(env, Disturbed):
+        raise UserError(
+            f"{env_id!r} is disturbed already, so its undisturbed observations would be unknown: "
+            "register the environment itself, and name its processes in disturbances"
+        )
+    check_composable(env)
     env = cast("EnvironmentLike", env)
     named = _named_processes(env_id, env, disturbances or {}, try_disturbances)
     _check_extras(env_id, env, named, extras)
@@ -395,6 +403,7 @@ def _disturbed(env_id: str, entry: _Entry, disturbance: str, parameters: dict[st
     acting = {channel: on(channel) for channel in CHANNELS}
     env = Disturbed(base, reward_from, DisturbedParams(env=params, **acting))
     check_processes(env)
+    warn_if_it_begins_too_late(env)
     return env
 
 

@@ -1,5 +1,6 @@
 """`fit_process`: estimates the parameters of a process from a log."""
 
+import dataclasses
 import os
 from collections.abc import Callable, Sequence
 
@@ -90,4 +91,17 @@ value |
         )
     if np.ptp(np.concatenate([part.ravel() for part in parts])) == 0.0:
         raise UserError("all values of the log are equal: nothing can be fitted")
-    return _FITS[kind](parts, max_slip)
+    fit = _FITS[kind](parts, max_slip)
+    elements = log.elements if isinstance(log, Recorded) else ()
+    return _of_elements(fit, elements) if elements else fit
+
+
+def _of_elements(fit: Fit, elements: tuple[int, ...]) -> Fit:
+    """The fit, whose process disturbs the elements that the recording disturbs."""
+    if hasattr(fit.process, "elements"):
+        return dataclasses.replace(fit, process=fit.process.replace(elements=elements))
+    note = (
+        f"The recording disturbs the elements {list(elements)}, but {type(fit.process).__name__} "
+        "disturbs all."
+    )
+    return dataclasses.replace(fit, notes=(*fit.notes, note))

@@ -14,8 +14,8 @@ from rtd3jax.agents.history import Steps, empty_steps, present, put_step, window
 from rtd3jax.agents.memory.base import Carry, Params
 from rtd3jax.agents.networks import Network, act, advance
 from rtd3jax.agents.normalise import Normaliser, as_read
-from rtd3jax.config import Acting
-from rtd3jax.errors import UserError
+from rtd3jax.config import ACTINGS, Acting
+from rtd3jax.errors import UserError, nearest
 from rtd3jax.policies.export.formats import writer_of
 from rtd3jax.policies.export.model import Model, fold
 from rtd3jax.registries import AGENTS
@@ -98,6 +98,7 @@ class Policy:
 
     def init(self, key: jax.Array | None = None) -> PolicyState:
         """The state before the first step of an episode; ``key`` is not used."""
+        self._check_acting()
         action_size = self.bounds.low.shape[0]
         runs_on = self.acting == "carry"
         return PolicyState(
@@ -108,6 +109,13 @@ class Policy:
             time=jnp.int32(0),
             carry=self.network.zero_carry(1) if runs_on else None,
         )
+
+    def _check_acting(self) -> None:
+        if self.acting not in ACTINGS:
+            raise UserError(
+                f"acting {self.acting!r} is unknown{nearest(str(self.acting), ACTINGS)}; choose "
+                f"{' or '.join(ACTINGS)}"
+            )
 
     def step(self, state: PolicyState, observation: jax.Array) -> tuple[jax.Array, PolicyState]:
         """The action for ``observation`` [O], and the next state, which contains both.
@@ -275,6 +283,7 @@ class Policy:
 
     def _metadata(self) -> dict[str, Any]:
         """The header of a saved policy."""
+        self._check_acting()
         return {
             "kind": KIND,
             "format": self._format,

@@ -28,6 +28,7 @@ from rtd3jax.study.contents import (
 from rtd3jax.study.lane_files import LaneFiles, cell_name, check_names
 from rtd3jax.study.lock import writer
 from rtd3jax.study.plan import Cell
+from rtd3jax.study.plants import Plants, check_plants, plants_of
 from rtd3jax.system.files import (
     user_path,
     write_bytes_atomically,
@@ -62,6 +63,7 @@ class RunDirectory:
     ):
         self.path = user_path(path)
         self.lanes = LaneFiles(self.path)
+        self._made: Plants | None = None
         self._asked = self.contents = Contents(tuple(cells), tuple(seeds), episodes)
         if prepare:
             self.prepare()
@@ -112,6 +114,7 @@ class RunDirectory:
                 f"--out {self.path} holds another study ({error}); "
                 "choose another directory, or remove that one"
             ) from error
+        check_plants(self.path, read_config(config).get("plants", {}), self._plants())
         self._check_longer(there)
         self._check_format(config)
         if self.contents != there:
@@ -160,7 +163,9 @@ class RunDirectory:
         config, news = self.path / CONFIG, self.plan()
         if not config.exists():
             study = self.contents.to_dict()
-            _write_config(config, {"format": FORMAT, "study": study, "made_with": _made_with()})
+            made_with, plants = _made_with(), self._plants()
+            new = {"format": FORMAT, "study": study, "plants": plants, "made_with": made_with}
+            _write_config(config, new)
             return news
         content = read_config(config)
         if added := additions_text(Contents.read(config), self.contents):
@@ -169,8 +174,15 @@ class RunDirectory:
                 {"added": added, "made_with": _made_with()},
             ]
             content["study"] = self.contents.to_dict()
+            content["plants"] = {**self._plants(), **content.get("plants", {})}
             _write_config(config, content)
         return news
+
+    def _plants(self) -> Plants:
+        """The plants that this sweep names; their environments are made once."""
+        if self._made is None:
+            self._made = plants_of(self._asked.cells)
+        return self._made
 
     def refresh(self) -> bool:
         """Read additions of another process; return whether there are any."""

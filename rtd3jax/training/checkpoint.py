@@ -232,7 +232,7 @@ class Checkpoints:
         for name, value in here.items():
             if not same(there.get(name), value):
                 raise UserError(
-                    f"{file} belongs to another {name} ({_difference(there.get(name), value)}); "
+                    f"{file} belongs to another {name} ({difference(there.get(name), value)}); "
                     f"use the same {name}, or start from the beginning"
                 )
         return longer
@@ -410,9 +410,10 @@ def _step(file: Path) -> int | None:
     return int(match[1]) if match else None
 
 
-def _difference(there: object, here: object) -> str:
+def difference(there: object, here: object) -> str:
+    """The first difference of two JSON-ready values, in words."""
     if isinstance(there, dict) and isinstance(here, dict):
         for name in {**there, **here}:
             if not same(there.get(name), here.get(name)):
-                return f"{name}: {_difference(there.get(name), here.get(name))}"
+                return f"{name}: {difference(there.get(name), here.get(name))}"
     return f"{there} there, {here} here"

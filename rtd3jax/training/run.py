@@ -8,15 +8,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, overload
 
-import jax
 import numpy as np
 
 from rtd3jax.config import Config
-from rtd3jax.envs.compat.simulated import is_simulated, simulated_identity
 from rtd3jax.envs.compat.simulator import fault_of
 from rtd3jax.envs.compat.simulator_state import simulator_state
 from rtd3jax.envs.entry import parameters_of
-from rtd3jax.envs.identity import in_words
 from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
 from rtd3jax.policies.trained import Policy
@@ -24,7 +21,7 @@ from rtd3jax.protocols import EnvironmentLike
 from rtd3jax.system.files import user_path
 from rtd3jax.system.numbers import is_whole
 from rtd3jax.system.switches import check_compiling
-from rtd3jax.training.checkpoint import PLANT, Checkpoints, named_numbers
+from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.feasibility import check_segments, warn_if_untrained
 from rtd3jax.training.lanes import (
     Group,
@@ -42,6 +39,7 @@ from rtd3jax.training.loop import (
     make_lane,
     make_program,
 )
+from rtd3jax.training.plant import plant_of
 from rtd3jax.training.progress import Progress
 from rtd3jax.training.start import Start, starts_of_path
 
@@ -234,19 +232,11 @@ def _checkpoints(
     env: EnvironmentLike,
     seconds: float | None,
 ) -> Checkpoints:
-    environment = {"env": str(getattr(env, "name", type(env).__name__)), "params": None}
-    # Static options are not among the parameters, such as the channel of a disturbance.
-    plant = in_words(env)
-    if is_simulated(env):  # the observed elements, and the arguments of its construction
-        environment["env"] = simulated_identity(env)
-        plant = getattr(env, "reward_from", "")
-
     def identity(job: Job) -> dict[str, Any]:
         index, seed = job.key
-        params = [named_numbers(leaf) for leaf in jax.tree.leaves(job.lane.env_params)]
         own = {"start": job.start.where} if job.start is not None else {}
-        about = {"params": params, PLANT: f"{plant} with {in_words(job.lane.env_params)}"}
-        return {**configs[index].to_dict(), **own, **environment, **about, "seed": seed}
+        plant = plant_of(env, job.lane.env_params)
+        return {**configs[index].to_dict(), **own, **plant, "seed": seed}
 
     return Checkpoints(lambda job: directories[job.cell] / f"seed-{job.seed}", identity, seconds)
 

@@ -134,6 +134,11 @@ class _Whole(_Lag):
         return {"now": jnp.zeros((batch, self.width), jnp.int32)}
 
 
+class _Ones(_Lag):
+    def zero(self, batch):
+        return {"now": jnp.ones((batch, self.width))}
+
+
 class _Fails(_Lag):
     def step(self, carry, token):
         raise RuntimeError("out of order")
@@ -145,6 +150,7 @@ class _Fails(_Lag):
         (_Wide, r"read must return float32 \[batch, 5\], not float32\[2, 10\]"),
         (_Grows, r"step must return a carry like zero's.*float32\[2, 5\]"),
         (_Whole, r"zero\(batch\) must return float32 arrays.*not int32\[2, 5\]"),
+        (_Ones, "zero must return zeros"),
         (_Fails, "failed in step: out of order"),
     ],
 )

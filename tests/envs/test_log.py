@@ -126,3 +126,11 @@ def test_a_column_whose_name_holds_the_word_episode():
         for columns in ("episode_slip", ["episode_slip"])
     ]
     assert lengths == [[2, 2], [2, 2]]
+
+
+@pytest.mark.parametrize("rows", ["left,right\n0.1,0.9,\n0.2,0.8,\n", "a\n0,1\n0,2\n"])
+def test_rows_with_more_cells_than_names_are_refused(rows, tmp_path):
+    """pandas would read the first cells as an index, and each column from its neighbour."""
+    (tmp_path / "log.csv").write_text(rows)
+    with pytest.raises(UserError, match="rows with more cells than its line of column names"):
+        read_log(tmp_path / "log.csv")

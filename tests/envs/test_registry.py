@@ -1,18 +1,22 @@
 """Tests of environments by name, and of their static parts."""
 
+import dataclasses
 import functools
 import itertools
+import warnings
 
 import gymnax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from gymnax.environments import environment, spaces
 
 from rtd3jax.envs import registry
 from rtd3jax.envs.builtin import DISTURBANCES, ENVIRONMENTS
-from rtd3jax.envs.disturbed import Disturbed
-from rtd3jax.envs.processes.disturbances import GaussianNoise, Hidden, Sine
+from rtd3jax.envs.disturbed import Disturbed, disturb
+from rtd3jax.envs.entry import parameters_of
+from rtd3jax.envs.processes.disturbances import GaussianNoise, Hidden, Pulses, Sine
 from rtd3jax.envs.processes.faults import Delay, Dropout
 from rtd3jax.envs.processes.process import Chain
 from rtd3jax.envs.registry import make, parse_disturbance, register
@@ -295,3 +299,64 @@ def test_a_cell_that_runs_again_registers_again(monkeypatch):
 def test_nearest_says_nothing_without_a_likeness():
     assert nearest("sigm", ["sigma"]) == "; did you mean 'sigma'?"
     assert nearest("xyz", ["sigma"]) == ""
+
+
+class Unlimited(environment.Environment):
+    """Its parameters do not state its time limit."""
+
+    default_params = None
+
+    def reset_env(self, key, params):
+        return jnp.zeros(3), jnp.int32(0)
+
+    def step_env(self, key, state, action, params):
+        return jnp.zeros(3), state + jnp.int32(1), jnp.sum(action), jnp.array(False), {}
+
+    def is_truncated(self, state, params):
+        return state >= 5
+
+    def action_space(self, params):
+        return spaces.Box(-1.0, 1.0, (1,))
+
+
+def test_processes_that_begin_later_need_to_know_the_time_limit():
+    for process in (Pulses(elements=(0,)), Chain((GaussianNoise(), Sine()))):
+        with pytest.warns(UserWarning, match="begin at any of 10,000 steps"):
+            disturb(Unlimited(), process)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        disturb(Unlimited(), GaussianNoise())
+        disturb(make("pendulum"), Sine())
+
+
+def test_what_cannot_be_disturbed_is_not_registered():
+    with pytest.raises(UserError, match="is disturbed already"):
+        register("noisy-pendulum", make("pendulum", "noise"))
+
+    class Bare:
+        default_params = None
+
+        def reset(self, key, params=None):
+            return jnp.zeros(3), jnp.int32(0)
+
+        def step(self, key, state, action, params=None):
+            return jnp.zeros(3), state, 0.0, False, False, {"final_observation": jnp.zeros(3)}
+
+        action_space = Unlimited.action_space
+
+    with pytest.raises(UserError, match="Bare has no reset_env"):
+        register("bare-plant", Bare())
+    assert "bare-plant" not in registry._entries
+
+
+def test_parameters_of_the_plant_inside_are_refused():
+    env = make("pendulum", "noise")
+    with pytest.raises(UserError, match=r"pass params=env\.default_params\.replace"):
+        parameters_of(env, env.default_params.env)
+
+    @dataclasses.dataclass
+    class Plain:
+        gain: float = 1.0
+
+    with pytest.raises(UserError, match=r"decorate it with flax\.struct\.dataclass"):
+        parameters_of(Unlimited(), Plain())

@@ -198,3 +198,11 @@ def test_a_batch_of_observations_gets_the_advice(policy):
     for step in (policy.step, jax.jit(policy.step)):
         with pytest.raises(rtd.UserError, match=r"observation\[0\], .* jax.vmap"):
             step(policy.init(), np.zeros((1, policy.observation_size)))
+
+
+def test_a_misspelt_way_of_acting_is_refused(tmp_path, policy):
+    wrong = policy.replace(acting="cary")
+    for use in (wrong.init, lambda: wrong.save(tmp_path / "policy.safetensors")):
+        with pytest.raises(rtd.UserError, match="acting 'cary' is unknown; did you mean 'carry'"):
+            use()
+    assert not list(tmp_path.iterdir())

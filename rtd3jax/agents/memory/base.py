@@ -8,6 +8,7 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from rtd3jax.errors import UserError, first_line
@@ -138,6 +139,13 @@ def check_memory(name: str, memory: Memory) -> None:
                 f"memory {name!r}: zero(batch) must return float32 arrays [batch, ...], not "
                 f"{leaf.dtype}{list(leaf.shape)} for a batch of {batch}"
             )
+    with jax.ensure_compile_time_eval():
+        start = [np.asarray(leaf) for leaf in jax.tree.leaves(memory.zero(1))]
+    if any(leaf.any() for leaf in start):
+        raise UserError(
+            f"memory {name!r}: zero must return zeros, which the empty steps of a window are; add "
+            "an offset in read instead"
+        )
     params = trace("step", memory.initial, jax.ShapeDtypeStruct((), jax.random.key(0).dtype))
     token = jax.ShapeDtypeStruct((batch, memory.inputs), jnp.float32)
 

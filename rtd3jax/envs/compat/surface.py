@@ -37,7 +37,10 @@ class Surface:
         """What the environment is given for an ``action`` [A]: within its bounds, in its type."""
         low, high = self.bounds
         wide = action.astype(np.float64).reshape(low.shape)
-        return np.minimum(np.maximum(wide, low), high).astype(self.actions.dtype)
+        within = np.minimum(np.maximum(wide, low), high)
+        if np.issubdtype(self.actions.dtype, np.integer):
+            within = np.rint(within)  # a cast alone would round towards zero
+        return within.astype(self.actions.dtype)
 
     def seen(self, flat: np.ndarray) -> np.ndarray:
         """The kept elements of all that it showed, float32 [O]."""

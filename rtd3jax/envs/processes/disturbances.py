@@ -4,6 +4,8 @@ They change what the agent observes, never the true state. All random parameters
 episode, unless a docstring says otherwise.
 """
 
+from typing import ClassVar
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -64,6 +66,8 @@ class Pulses(Process):
     count: int = struct.field(pytree_node=False, default=10)
     length: int = struct.field(pytree_node=False, default=3)
     elements: tuple[int, ...] = struct.field(pytree_node=False, default=(0, 1))
+
+    begins_later: ClassVar[bool] = True
 
     def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> PulsesState:
         """The state in which no pulse has begun."""
@@ -141,6 +145,8 @@ class Sine(Process):
     elements: tuple[int, ...] = struct.field(pytree_node=False, default=(0, 1, 2))
     waves: int = struct.field(pytree_node=False, default=1)
 
+    begins_later: ClassVar[bool] = True
+
     def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> SineState:
         """Draw amplitude, period and start of every wave."""
         key_amplitude, key_period, key_start = jax.random.split(key, 3)
@@ -188,6 +194,8 @@ class DampedSine(Process):
     period_min: float = 10.0
     period_max: float = 100.0
     elements: tuple[int, ...] = struct.field(pytree_node=False, default=(0, 1, 2))
+
+    begins_later: ClassVar[bool] = True
 
     def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> SineState:
         """Draw amplitude, period and start of the wave."""

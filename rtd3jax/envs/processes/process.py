@@ -4,7 +4,7 @@ A process is a pytree. Its numeric parameters are leaves: one compiled program s
 values, and can be vmapped over them. Its structural options are static.
 """
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,9 @@ from rtd3jax.system.pytrees import TypedNode
 
 class Process(TypedNode):
     """Base of every process. A signal is a float vector, such as an observation [O]."""
+
+    begins_later: ClassVar[bool] = False
+    """Whether it acts from a step on that is drawn from the whole episode."""
 
     def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> Any:
         """Draw the state for an episode of ``horizon`` steps (may be traced) and signals [size]."""

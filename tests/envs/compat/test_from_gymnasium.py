@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import time
 import warnings
+from types import SimpleNamespace
 
 import gymnasium
 import jax
@@ -13,6 +14,7 @@ import pytest
 
 import rtd3jax as rtd
 from rtd3jax.envs.compat.simulator import Fault, Simulator, close_simulators
+from rtd3jax.envs.compat.surface import surface_of
 
 SMALL = rtd.Config(
     algorithm="td3",
@@ -395,3 +397,18 @@ def test_whoever_plays_leaves_no_simulator_busy():
     assert not env.fleet._busy
     with pytest.raises(gymnasium.error.ResetNeeded):
         played.step(np.zeros(2, np.float32))
+
+
+def test_the_reason_of_a_failing_simulator_is_a_finding():
+    with pytest.raises(rtd.UserError, match="step returned 4 values"), pytest.warns(UserWarning):
+        rtd.check_env(environment(fault="four", at=2))
+
+
+def test_actions_of_whole_numbers_are_rounded():
+    """A cast alone would send 1 for no action below exactly 1."""
+    whole = gymnasium.spaces.Box(-2, 2, (2,), np.int32)
+    seen = gymnasium.spaces.Box(-1.0, 1.0, (2,))
+    example = SimpleNamespace(action_space=whole, observation_space=seen, spec=None)
+    surface = surface_of(example, "whole", None, 5)[0]
+    for action, sent in ((0.6, 1), (-0.6, -1), (0.4, 0), (1.99, 2), (9.0, 2)):
+        np.testing.assert_array_equal(surface.command(np.full(2, action, np.float32)), sent)
