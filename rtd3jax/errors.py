@@ -15,5 +15,10 @@ def nearest(word: str, choices: Iterable[str]) -> str:
 
 
 def first_line(error: BaseException) -> str:
-    """The first line of an error's message, or the error's type if the message is empty."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+    """The line of an error's message that says most, or the error's type if there is none.
+
+    This is the first line; of a message that holds a traceback, as those of callbacks to the host
+    do, it is the last.
+    """
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    return lines[-1].strip() if "Traceback (most recent call last)" in lines[0] else lines[0]

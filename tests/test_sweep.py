@@ -117,6 +117,12 @@ def test_a_lost_lane_is_reported_and_the_exit_status_says_so(tmp_path, capsys):
         ("--preset quick --hidden-size 200000", "one lane needs"),
         ("--preset quick --history-lengths 0", "history_length must be at least 1"),
         ("--preset rover --env pendulum", "has settings for rover"),
+        ("--preset quick --dry-run --hidden-size 200000", "one lane needs"),
+        ("--preset quick --dry-run --start nowhere", "nowhere"),
+        ("--preset quick --dry-run --shard 9/4", "not of the form i/n"),
+        ("--preset quick --dry-run --checkpoint-every banana", "banana"),
+        ("--preset quick --import ./tank.py", "give a module's name: --import tank"),
+        ("--preset quick --import=", "--import '': Empty module name"),
     ],
 )
 def test_bad_input_is_one_line(arguments, message, capsys, tmp_path):
@@ -210,6 +216,34 @@ def test_fresh_keeps_what_was_there(tmp_path, capsys):
     assert "0.5" in (out / "summary.md").read_text()
 
 
+def test_fresh_does_not_rename_the_working_directory(tmp_path, monkeypatch, capsys):
+    out = tmp_path / "run"
+    assert sweep.main([*TINY, "--out", str(out)]) == 0
+    monkeypatch.chdir(out)
+    assert sweep.main([*TINY, "--out", ".", "--fresh"]) == 2
+    assert "start the command from outside" in capsys.readouterr().err
+    assert len(list(out.rglob("*.safetensors"))) == 4
+
+
+def test_an_empty_directory_name_is_refused(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert sweep.main([*TINY, "--out", ""]) == 2
+    assert "--out is empty" in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+def test_one_damaged_file_does_not_hide_the_others(tmp_path, capsys):
+    out = tmp_path / "run"
+    assert sweep.main([*TINY, "--out", str(out)]) == 0
+    next(out.glob("lanes/*lstm*/seed-1.safetensors")).write_bytes(b"")
+    with (out / "log.jsonl").open("ab") as log:
+        log.write(b"\xff\n")
+    capsys.readouterr()
+    assert sweep.main(["--out", str(out), "--status"]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert sum(" done " in line for line in lines) == 3
+    assert sum(" failed " in line and "cannot be read" in line for line in lines) == 1
+
+
 def test_shards_fill_one_directory_with_the_same_tables(tmp_path):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     assert sweep.main([*TINY, "--out", str(whole)]) == 0
@@ -231,6 +265,8 @@ def test_a_second_writer_is_refused_and_a_dead_one_is_not_in_the_way(tmp_path, c
     out = tmp_path / "run"
     assert sweep.main([*TINY, "--out", str(out), "--shard", "2/2"]) == 0
     with writer(out, (1, 2)):
+        assert sweep.main([*TINY, "--out", str(out), "--shard", "1/3"]) == 2
+        assert "another process divides the study into 2 shards" in capsys.readouterr().err
         assert sweep.main([*TINY, "--out", str(out)]) == 2
         assert "another process is writing to it" in capsys.readouterr().err
         assert sweep.main([*TINY, "--out", str(out), "--shard", "1/2"]) == 2
@@ -256,6 +292,7 @@ def test_a_cell_that_raises_does_not_stop_the_others(tmp_path, monkeypatch, caps
     assert "seed 1 failed: the plant is on fire" in capsys.readouterr().err
     assert sweep.main(["--out", str(out), "--status"]) == 1
     assert "failed             0  the plant is on fire" in capsys.readouterr().out
+    assert "td3, l = 0, seed 1, step ?: failed: the plant" in (out / "summary.md").read_text()
     monkeypatch.setattr(lanes, "_chunk", real)
     assert sweep.main([*TINY, "--out", str(out)]) == 0
 

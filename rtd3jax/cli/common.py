@@ -2,6 +2,7 @@
 
 import argparse
 import io
+import os
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -29,6 +30,12 @@ def exit_status(work: Callable[[], int], place: Callable[[], Any]) -> int:
     """
     try:
         return work()
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # the reader has ended, such as head
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
     except OSError as error:
@@ -36,6 +43,13 @@ def exit_status(work: Callable[[], int], place: Callable[[], Any]) -> int:
         # command continues from them.
         print(f"error: {error.filename or place()}: {error.strerror or error}", file=sys.stderr)
     return 2
+
+
+def not_empty(name: str, value: Any) -> Any:
+    """The value of an option that names something; UserError if it is empty."""
+    if not str(value):
+        raise UserError(f"--{name} is empty: name a path, or leave it out")
+    return value
 
 
 def add_import(group: argparse._ActionsContainer) -> None:

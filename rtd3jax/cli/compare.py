@@ -7,7 +7,7 @@ prints a Markdown table; with --out DIR it also writes DIR/compare.parquet and D
 import argparse
 from collections.abc import Sequence
 
-from rtd3jax.cli.common import add_import, exit_status, replace_unprintable
+from rtd3jax.cli.common import add_import, exit_status, not_empty, replace_unprintable
 from rtd3jax.errors import UserError
 from rtd3jax.study.comparison import MEASURES, compare_runs, comparison_markdown, differing_settings
 from rtd3jax.study.rundir import RunDirectory
@@ -31,7 +31,7 @@ def _run(options: argparse.Namespace) -> int:
     text = comparison_markdown(table, names, settings, measure)
     print(text, end="")
     if options.out is not None:
-        out = user_path(options.out)
+        out = user_path(not_empty("out", options.out))
         if out.exists() and not out.is_dir():
             raise UserError(f"{out} is a file: --out must name a directory")
         write_bytes_atomically(out / "compare.parquet", table.to_parquet(index=False))

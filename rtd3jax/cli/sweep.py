@@ -114,6 +114,10 @@ def _run(options: argparse.Namespace) -> int:
     jobs = directory.jobs(strategy)
     waiting = [job for job in jobs if options.fresh or not directory.lanes.is_done(*job.key)]
     shares = shares_of(processes, waiting, strategy)
+    # Raises UserError before any file is written.
+    interval = sweep_options.parse_interval(options.checkpoint_every)
+    shard = _shard(options)
+    add_starts(directory, jobs, write=False, fresh=options.fresh)
     if options.dry_run:
         say = functools.partial(print, file=sys.stderr, flush=True)
         print(plan_text(directory.cells, directory.seeds, jobs, strategy, usable_memory(), say))
@@ -125,10 +129,6 @@ def _run(options: argparse.Namespace) -> int:
         at_once = len(jobs)
     else:
         at_once = lanes_at_once(jobs, strategy, len(workers()), usable_memory())
-    interval = sweep_options.parse_interval(options.checkpoint_every)
-    shard = _shard(options)
-    # Raises UserError before any file is written.
-    add_starts(directory, jobs, write=False, fresh=options.fresh)
     if options.fresh:
         _set_aside(out)
     if additions := directory.prepare():
@@ -205,6 +205,11 @@ def _set_aside(out: Path) -> None:
     """Rename a run directory, so that its lanes are kept."""
     if not holds_study(out):
         return
+    if Path.cwd().is_relative_to(out.resolve()):
+        raise UserError(
+            f"--fresh would rename {out.resolve()}, which is the working directory or holds it: "
+            "start the command from outside"
+        )
     with writer(out, None):
         for number in range(1, 10_000):
             aside = out.with_name(f"{out.name}.old-{number}")

@@ -10,7 +10,7 @@ from typing import Any, Literal, NoReturn, get_args, get_origin
 import jax
 
 from rtd3jax.agents.variants import ALGORITHMS
-from rtd3jax.cli.common import add_import, replace_unprintable
+from rtd3jax.cli.common import add_import, not_empty, replace_unprintable
 from rtd3jax.config import Config
 from rtd3jax.envs.builtin import LISTED
 from rtd3jax.errors import UserError
@@ -190,9 +190,12 @@ def overrides(options: argparse.Namespace) -> dict[str, Any]:
 
 def out(options: argparse.Namespace) -> Path:
     """The run directory."""
-    if not (options.out or options.preset or options.env):
+    given: Any = options.out
+    if given is not None:
+        return user_path(not_empty("out", given))
+    if not (options.preset or options.env):
         raise UserError("name the run directory: --out DIR")
-    return user_path(options.out or Path("runs") / (options.preset or options.env))
+    return user_path(Path("runs") / (options.preset or options.env))
 
 
 def count(name: str, value: int, most: int = 100_000) -> int:

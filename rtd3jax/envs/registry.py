@@ -186,7 +186,8 @@ def register(
         _entries[env_id] = _Entry(None, cast("Callable[..., Any]", env), {}, module)
         return
     check_gymnax(env)
-    if isinstance(env, Disturbed):
+    own = env.default_params if isinstance(env, Disturbed) else None
+    if not all(isinstance(getattr(own, name, NoDisturbance()), NoDisturbance) for name in CHANNELS):
         raise UserError(
             f"{env_id!r} is disturbed already, so its undisturbed observations would be unknown: "
             "register the environment itself, and name its processes in disturbances"

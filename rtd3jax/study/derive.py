@@ -60,6 +60,10 @@ def _derive(directory: RunDirectory, references: Iterable[Reference], pictures: 
         for seed in directory.seeds:
             if directory.lanes.is_done(cell, seed):
                 _read_lane(directory.lanes, cell, seed, curves, episodes, metrics, failures)
+            elif (reason := directory.lanes.error(cell, seed)) is not None:
+                failures.append(
+                    {**cell.key, "seed": seed, "step": "?", "reason": f"failed: {reason}"}
+                )
     for reference in references:
         episodes += _reference_rows(reference)
     write_table(directory.path / "curves.parquet", curves, CURVES)

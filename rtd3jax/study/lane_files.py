@@ -53,6 +53,11 @@ class LaneFiles:
         """The file with the reason why a lane could not be trained."""
         return self.lane_path(cell, seed).with_suffix(".error.txt")
 
+    def error(self, cell: Cell, seed: int) -> str | None:
+        """Why the lane could not be trained; None without an error."""
+        path = self.error_path(cell, seed)
+        return path.read_text("utf-8", "replace").strip() if path.exists() else None
+
     def is_done(self, cell: Cell, seed: int) -> bool:
         """Whether the lane was trained to its current number of steps, or was lost."""
         path = self.lane_path(cell, seed)

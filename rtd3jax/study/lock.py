@@ -37,10 +37,25 @@ def writer(directory: Path, shard: tuple[int, int] | None) -> Iterator[list[int]
         whole = "another process is writing to it"
         handles = [_hold(stack, directory, directory / ".lock", shard is not None, whole)]
         if shard is not None:
+            _refuse_other_divisions(directory, shard[1])
             name = f".lock-{shard[0]}-of-{shard[1]}"
             taken = f"another process is writing shard {shard[0]}/{shard[1]} of it"
             handles.append(_hold(stack, directory, directory / name, False, taken))
         yield handles
+
+
+def _refuse_other_divisions(directory: Path, count: int) -> None:
+    """Raise UserError while a process divides the study into another number of shards.
+
+    Its shards would share lanes with those of ``count``.
+    """
+    for path in directory.glob(".lock-*-of-*"):
+        other = path.name.rpartition("-")[2]
+        if other.isdigit() and int(other) != count and _is_locked(path):
+            raise UserError(
+                f"--out {directory}: another process divides the study into {other} shards; wait "
+                f"for it, or use --shard i/{other}"
+            )
 
 
 @contextlib.contextmanager
@@ -55,8 +70,12 @@ def deriver(directory: Path) -> Iterator[None]:
 
 def is_held(directory: Path) -> bool:
     """Whether a process is writing to the directory now."""
+    return _is_locked(directory / ".lock")
+
+
+def _is_locked(path: Path) -> bool:
     try:
-        handle = open_for_locking(directory / ".lock", create=False)
+        handle = open_for_locking(path, create=False)
     except OSError:
         return False
     try:

@@ -27,7 +27,7 @@ def repair_log(path: Path) -> dict[tuple[Any, ...], Any]:
 
 def read_log(path: Path) -> list[dict[str, Any]]:
     """Rows of a log, without the incomplete line of a killed process."""
-    return parse_log(path.read_text("utf-8")) if path.exists() else []
+    return parse_log(path.read_text("utf-8", "replace")) if path.exists() else []
 
 
 def parse_log(text: str) -> list[dict[str, Any]]:

@@ -39,7 +39,11 @@ class LogReader:
             text = file.read()
         text = text[: text.rfind(b"\n") + 1]
         self._offset += len(text)
-        rows = [row for row in parse_log(text.decode()) if lane_of(row)[:-1] in self._cells]
+        rows = [
+            row
+            for row in parse_log(text.decode("utf-8", "replace"))
+            if lane_of(row)[:-1] in self._cells
+        ]
         for lane, step in steps_reached(rows).items():
             self._reached[lane] = max(step, self._reached.get(lane, 0))
         return rows

@@ -230,8 +230,8 @@ def plan_text(
 ) -> str:
     """The plan of a sweep as text, with memory and time; ``memory`` is in bytes."""
     count = len(workers())
+    fit = lanes_at_once(jobs, strategy, count, memory)  # before a lane is allocated and timed
     cost = estimate(jobs, strategy, say)
-    fit = lanes_at_once(jobs, strategy, count, memory)
     waits = f"; the other {len(jobs) - fit:,} wait" if fit < len(jobs) else ""
     lines = [f"{len(cells)} cells × {len(seeds)} seeds = {len(jobs)} lanes"]
     for cell in cells:

@@ -5,6 +5,7 @@ import time
 
 import numpy as np
 
+from rtd3jax.errors import first_line
 from rtd3jax.evaluation.rollout import both_returns
 from rtd3jax.study.interim import InterimResults
 from rtd3jax.study.log import LOG, append_rows, repair_log
@@ -50,7 +51,7 @@ class Recorder:
     def update(self, group: Group) -> None:
         """Record a chunk of ``group``, its end, or its error."""
         if group.error is not None:
-            reason = str(group.error).splitlines()[0] if str(group.error) else repr(group.error)
+            reason = first_line(group.error)
             for job in group.jobs:
                 cell, seed = job.key
                 self._directory.lanes.write_error(cell, seed, reason)

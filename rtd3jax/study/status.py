@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from rtd3jax.errors import UserError
 from rtd3jax.study.lane_files import LaneFiles
 from rtd3jax.study.lock import is_held
 from rtd3jax.study.log import LOG, lane_of, read_log, steps_reached
@@ -30,17 +31,20 @@ def _lane_status(
     lanes: LaneFiles, cell: Cell, seed: int, begun: str, logged: dict[Any, int]
 ) -> dict[str, Any]:
     if lanes.is_done(cell, seed):
-        failure = read_arrays(lanes.lane_path(cell, seed))[1]["failure"]
+        try:
+            arrays = read_arrays(lanes.lane_path(cell, seed))
+        except UserError as error:  # one damaged file does not hide the others
+            return {"status": "failed", "step": 0, "reason": str(error)}
+        failure = arrays[1]["failure"]
         if failure is not None:
             return {"status": "lost", "step": failure["step"], "reason": failure["reason"]}
         return {"status": "done", "step": cell.config.total_steps, "reason": ""}
-    if lanes.error_path(cell, seed).exists():
-        reason = lanes.error_path(cell, seed).read_text("utf-8").strip()
+    if (reason := lanes.error(cell, seed)) is not None:
         return {"status": "failed", "step": 0, "reason": reason}
     steps = checkpoint_steps(lanes.checkpoint_directory(cell, seed))
     kept = max(steps, default=0)
     reached = logged.get(lane_of({**cell.key, "seed": seed}), 0)
     # If the log reaches the end but there is no file, the file was removed to train again.
     reached = max(kept, reached if reached < cell.config.total_steps else 0)
-    reason = f"next start at step {kept:,}" if reached and begun != "running" else ""
-    return {"status": begun if reached else "planned", "step": reached, "reason": reason}
+    later = f"next start at step {kept:,}" if reached and begun != "running" else ""
+    return {"status": begun if reached else "planned", "step": reached, "reason": later}

@@ -48,11 +48,11 @@ def transfer(
         own = list(dict.fromkeys(c.disturbance for c in directory.cells if c.env == cell.env))
         for disturbance in own if tested_on is None else tested_on:
             environment = cell.env, disturbance
-            if environment not in environments:
-                name, parameters = parse_disturbance(disturbance)
-                environments[environment] = make(cell.env, name, **parameters)
             for seed in directory.seeds:
                 try:
+                    if environment not in environments:
+                        name, parameters = parse_disturbance(disturbance)
+                        environments[environment] = make(cell.env, name, **parameters)
                     if not directory.lanes.is_done(cell, seed):
                         continue
                     both = both_returns(
@@ -80,6 +80,8 @@ def transfer(
                 ]
     for (trained_on, tested, reason), agents in problems.items():
         say(f"not tested on {tested}: {agents} agents trained on {trained_on}: {reason}")
+    if problems and not environments:  # no environment has such a disturbance
+        raise UserError(next(iter(problems))[2])
     if not rows:
         raise UserError(f"no policy in {directory.path} could be tested: --status prints the lanes")
     table = pd.DataFrame(rows, columns=[*COLUMNS, "true_return"])

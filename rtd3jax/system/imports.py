@@ -21,7 +21,9 @@ def import_modules(modules: Sequence[str]) -> None:
         sys.path.insert(0, os.getcwd())
         try:
             importlib.import_module(module)
-        except ImportError as error:
-            raise UserError(f"--import {module}: {error}") from error
+        except (ImportError, TypeError, ValueError) as error:
+            name = str(module).removesuffix(".py").rpartition(os.sep)[2]
+            hint = f"; give a module's name: --import {name}" if name and name != module else ""
+            raise UserError(f"--import {module or repr('')}: {error}{hint}") from error
         finally:
             sys.path.pop(0)

@@ -332,6 +332,7 @@ def test_processes_that_begin_later_need_to_know_the_time_limit():
 def test_what_cannot_be_disturbed_is_not_registered():
     with pytest.raises(UserError, match="is disturbed already"):
         register("noisy-pendulum", make("pendulum", "noise"))
+    register("heavy-pendulum", make("pendulum", m=2.0), replace=True)
 
     class Bare:
         default_params = None

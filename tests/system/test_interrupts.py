@@ -1,5 +1,7 @@
 """Tests that an interrupt does not end what is being saved."""
 
+import io
+import os
 import signal
 import threading
 
@@ -41,3 +43,33 @@ def test_other_threads_leave_signals_alone():
     thread.start()
     thread.join()
     assert found == [signal.getsignal(signal.SIGINT)]
+
+
+def test_commands_end_in_one_line_after_an_interrupt_or_a_closed_pipe(capsys, monkeypatch):
+    from rtd3jax.cli import common
+
+    def interrupt():
+        raise KeyboardInterrupt
+
+    assert common.exit_status(interrupt, lambda: "run") == 130
+    assert capsys.readouterr().err == "interrupted\n"
+
+    def broken():
+        raise BrokenPipeError(32, "Broken pipe")
+
+    redirected = []
+    monkeypatch.setattr(common.os, "dup2", lambda *handles: redirected.append(handles))
+    monkeypatch.setattr(common.sys, "stdout", io.TextIOWrapper(io.FileIO(os.dup(1), "w")))
+    assert common.exit_status(broken, lambda: "run") == 0
+    assert redirected and capsys.readouterr().err == ""
+
+
+def test_the_last_line_of_a_traceback_says_most():
+    from rtd3jax.errors import first_line
+
+    callback = RuntimeError(
+        "INTERNAL: callback: Traceback (most recent call last):\n  File x\nOSError: no licence\n"
+    )
+    assert first_line(callback) == "OSError: no licence"
+    assert first_line(ValueError("first\nsecond")) == "first"
+    assert first_line(ValueError()) == "ValueError"
