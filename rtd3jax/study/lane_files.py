@@ -5,6 +5,7 @@ final episodes. All other files of a run directory, except its configuration and
 derived from these files.
 """
 
+import hashlib
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -33,6 +34,10 @@ class LaneFiles:
     def lane_path(self, cell: Cell, seed: int) -> Path:
         """The path of a lane's file."""
         return self._within("lanes", cell_name(cell), f"seed-{seed}.safetensors")
+
+    def digest(self, cell: Cell, seed: int) -> str:
+        """A digest of a lane's file: another one if the lane was trained further, or again."""
+        return hashlib.sha256(self.lane_path(cell, seed).read_bytes()).hexdigest()
 
     def checkpoint_directory(self, cell: Cell, seed: int) -> Path:
         """The directory of a lane's checkpoints."""

@@ -16,6 +16,7 @@ from rtd3jax.study.colours import ordered
 from rtd3jax.study.lane_files import file_name
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.report.robustness import COLUMNS, FILE
+from rtd3jax.study.report.table import LANE
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.system.files import write_bytes_atomically
 
@@ -62,11 +63,11 @@ def run_robustness(
             say(f"not tested: {error}")
             continue
         check_policy(policy, own)
-        identity = {**cell.key, "seed": seed}
+        identity = {**cell.key, "seed": seed, LANE: directory.lanes.digest(cell, seed)}
         rows += [{**identity, **row} for row in rows_of(policy, own, episodes, seed)]
     if not rows:
         raise UserError(f"no policy in {directory.path} could be tested: --status prints the lanes")
-    table = pd.DataFrame(rows, columns=list(COLUMNS))
+    table = pd.DataFrame(rows, columns=[*COLUMNS, LANE])
     write_bytes_atomically(directory.path / FILE, table.to_parquet(index=False))
     return table
 

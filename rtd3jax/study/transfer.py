@@ -11,6 +11,7 @@ from rtd3jax.envs.registry import make, parse_disturbance
 from rtd3jax.errors import UserError
 from rtd3jax.evaluation.rollout import both_returns
 from rtd3jax.study.plan import Cell
+from rtd3jax.study.report.table import LANE
 from rtd3jax.study.report.transfer import COLUMNS, FILE
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.system.files import write_bytes_atomically
@@ -44,6 +45,7 @@ def transfer(
     problems: dict[tuple[str, str, str], int] = {}
     # The file of a policy is read once for all disturbances.
     policy_of = functools.lru_cache(maxsize=len(directory.seeds))(directory.lanes.policy)
+    digest_of = functools.lru_cache(maxsize=len(directory.seeds))(directory.lanes.digest)
     for cell in directory.cells if cells is None else cells:
         own = list(dict.fromkeys(c.disturbance for c in directory.cells if c.env == cell.env))
         for disturbance in own if tested_on is None else tested_on:
@@ -73,6 +75,7 @@ def transfer(
                         "episode": episode,
                         "return": float(value),
                         "true_return": float(true),
+                        LANE: digest_of(cell, seed),
                     }
                     for episode, (value, true) in enumerate(
                         zip(*map(np.asarray, both), strict=True)
@@ -84,7 +87,7 @@ def transfer(
         raise UserError(next(iter(problems))[2])
     if not rows:
         raise UserError(f"no policy in {directory.path} could be tested: --status prints the lanes")
-    table = pd.DataFrame(rows, columns=[*COLUMNS, "true_return"])
+    table = pd.DataFrame(rows, columns=[*COLUMNS, "true_return", LANE])
     if write:
         write_bytes_atomically(directory.path / FILE, table.to_parquet(index=False))
     return table

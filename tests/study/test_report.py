@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 
 import numpy as np
 import pandas as pd
@@ -11,13 +12,15 @@ from browser import chromium
 from random_policies import random_policy
 
 import rtd3jax as rtd
-from rtd3jax import report, transfer
+from rtd3jax import report, stress, transfer
 from rtd3jax.envs.description import Ceiling
 from rtd3jax.study import ceilings
 from rtd3jax.study.derive import Reference, derive
 from rtd3jax.study.plan import Grid, make_cells
+from rtd3jax.study.report.page import page_data
 from rtd3jax.study.report.playback import record_episodes
 from rtd3jax.study.rundir import RunDirectory
+from rtd3jax.system.files import read_arrays, write_arrays
 
 AGENTS = ("td3", "lstm-td3-1ha1hc")
 GRIDS = {
@@ -203,6 +206,34 @@ def test_an_unfinished_run_has_a_page_that_says_so(runs, tmp_path, monkeypatch):
     assert data["status"] == {"planned": 12}
     assert any("curves.parquet" in note for note in data["notes"])
     assert data["transfer"] is None and data["playback"] == []
+
+
+def test_returns_of_policies_that_were_trained_further_are_left_out(runs, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(runs["rover"], run)
+    assert stress.main([str(run), "--episodes", "1", "--stresses", "noise=0"]) == 0
+    directory = RunDirectory.open(run)
+    before = page_data(directory, complete=False, playback=False)
+    assert before["notes"] == [] and before["robustness"]
+    changed = 0
+    for cell in directory.cells[:2]:
+        for seed in directory.seeds:
+            path = directory.lanes.lane_path(cell, seed)
+            arrays, metadata = read_arrays(path)
+            write_arrays(path, arrays, {**metadata, "again": True})
+            changed += 1
+    after = page_data(directory, complete=False, playback=False)
+    for name in ("transfer", "robustness"):
+        assert len(after[name]) == len(before[name]) - 2
+        (gone,) = [note for note in after["notes"] if note.startswith(f"{name}.parquet has")]
+        assert f"returns of {changed} policies that the study has no longer" in gone
+        assert any(note.startswith(f"{name}.parquet lacks {changed} of") for note in after["notes"])
+
+    # A table of an earlier version does not tell its policies.
+    table = pd.read_parquet(run / "transfer.parquet").drop(columns="lane")
+    table.to_parquet(run / "transfer.parquet")
+    old = page_data(directory, complete=False, playback=False)
+    assert old["transfer"] == before["transfer"]
 
 
 @pytest.mark.parametrize(

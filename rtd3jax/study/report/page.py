@@ -13,9 +13,7 @@ from rtd3jax.errors import UserError, first_line
 from rtd3jax.study.ceilings import ceilings_of
 from rtd3jax.study.report.data import study_data, tables_of
 from rtd3jax.study.report.playback import recordings
-from rtd3jax.study.report.robustness import FILE as ROBUSTNESS
 from rtd3jax.study.report.robustness import robustness_data
-from rtd3jax.study.report.transfer import FILE as TRANSFER
 from rtd3jax.study.report.transfer import transfer_data
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.statistics import seed_means
@@ -87,12 +85,12 @@ def page_data(directory: RunDirectory, *, complete: bool, playback: bool) -> dic
     for environment in data["environments"]:
         environment["ceiling"] = ceilings.get((environment["env"], environment["disturbance"]))
     try:
-        data["transfer"] = transfer_data(directory.path / TRANSFER)
+        data["transfer"] = transfer_data(directory, notes)
     except UserError as error:
         data["transfer"] = None
         notes.append(str(error))
     try:
-        data["robustness"] = robustness_data(directory.path / ROBUSTNESS, directory.cells)
+        data["robustness"] = robustness_data(directory, notes)
     except UserError as error:
         data["robustness"] = None
         notes.append(str(error))

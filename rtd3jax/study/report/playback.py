@@ -6,7 +6,6 @@ the action, the reward, and the hidden variable, if the environment provides it.
 
 import base64
 import dataclasses
-import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -55,8 +54,8 @@ def recordings(
         seed = _middle_seed(directory, cell, lanes)
         if seed is None:
             continue
-        digest = hashlib.sha256(directory.lanes.lane_path(cell, seed).read_bytes()).hexdigest()
-        stamp = {"format": FORMAT, "lane": digest, "episodes": count}
+        lane = directory.lanes.digest(cell, seed)
+        stamp = {"format": FORMAT, "lane": lane, "episodes": count}
         path = directory.lanes.playback_path(cell, seed)
         kept = _read(path, stamp)
         if kept is None and record:

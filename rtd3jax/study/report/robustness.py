@@ -1,16 +1,15 @@
 """The test of robustness of a study, as data of its page."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from rtd3jax.evaluation.robustness import MEASURED
-from rtd3jax.study.plan import Cell
 from rtd3jax.study.report.data import MEASURES, rows_of
-from rtd3jax.study.report.table import read_table
+from rtd3jax.study.report.table import of_these_policies, read_table
 from rtd3jax.study.results import CELL, rounded_number
+from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.statistics import iqm_bands
 
 FILE = "robustness.parquet"
@@ -18,17 +17,21 @@ COLUMNS = (*CELL, "seed", *MEASURED)
 """One row per lane, stress and value: means over the episodes of a lane."""
 
 
-def robustness_data(path: Path, cells: list[Cell]) -> list[dict[str, Any]] | None:
+def robustness_data(directory: RunDirectory, notes: list[str]) -> list[dict[str, Any]] | None:
     """Each stress of each cell, with a curve over its values; None without a table.
 
-    ``cell`` is an index of ``cells``. A curve is the interquartile mean over the seeds, with the
+    ``cell`` is an index of the study's cells. ``notes`` receives a line if the study's policies are
+    not those of the table. A curve is the interquartile mean over the seeds, with the
     bounds of its interval, as of learning curves.
 
     Raises:
         UserError: when the file exists, but is not such a table.
     """
-    table = read_table(path, COLUMNS)
+    table = read_table(directory.path / FILE, COLUMNS)
     if table is None:
+        return None
+    table = of_these_policies(table, directory, "robustness", notes)
+    if table.empty:
         return None
     return [
         {
@@ -37,7 +40,7 @@ def robustness_data(path: Path, cells: list[Cell]) -> list[dict[str, Any]] | Non
             "quantity": str(rows["quantity"].iloc[0]),
             "curves": {measure: _curve(rows, measure) for measure in MEASURES},
         }
-        for index, cell in enumerate(cells)
+        for index, cell in enumerate(directory.cells)
         for stress, rows in rows_of(table, cell).groupby("stress", sort=False)
     ]
 

@@ -1,12 +1,12 @@
 """The transfer matrix: returns of trained agents under other disturbances."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rtd3jax.study.report.data import summary_data
-from rtd3jax.study.report.table import read_table
+from rtd3jax.study.report.table import of_these_policies, read_table
+from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.statistics import summarise
 
 FILE = "transfer.parquet"
@@ -15,14 +15,19 @@ COLUMNS = (*_CELL, "seed", "episode", "return")
 """One row per lane, tested disturbance and episode."""
 
 
-def transfer_data(path: Path) -> list[dict[str, Any]] | None:
+def transfer_data(directory: RunDirectory, notes: list[str]) -> list[dict[str, Any]] | None:
     """A summary over the seeds for each agent, training and test; None without a table.
+
+    ``notes`` receives a line if the study's policies are not those of the table.
 
     Raises:
         UserError: when the file exists, but is not such a table.
     """
-    table = read_table(path, COLUMNS)
+    table = read_table(directory.path / FILE, COLUMNS)
     if table is None:
+        return None
+    table = of_these_policies(table, directory, "transfer", notes)
+    if table.empty:
         return None
     table = table.astype({"return": np.float64})
     seeds = table.groupby([*_CELL, "seed"], sort=False)["return"]
