@@ -17,22 +17,27 @@ def replace_unprintable() -> None:
             stream.reconfigure(errors="replace")
 
 
-def exit_status(work: Callable[[], int], place: Callable[[], Any]) -> int:
+def exit_status(
+    work: Callable[[], int],
+    place: Callable[[], Any],
+    interrupted: Callable[[KeyboardInterrupt], int] = lambda _: 130,
+) -> int:
     """Run a command and return its exit status.
 
     Args:
         work: the command; it returns the status.
         place: returns the path that an error message names when a file operation failed and the
             system named no file.
+        interrupted: returns the status after an interrupt, for which a line is printed.
 
     Returns:
         what ``work`` returns; 2, after one line on stderr, if the input or a file is at fault.
     """
     try:
         return work()
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return 130
+    except KeyboardInterrupt as interrupt:
+        print("interrupted: repeat the command", file=sys.stderr)
+        return interrupted(interrupt)
     except BrokenPipeError:  # the reader has ended, such as head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
@@ -45,7 +50,7 @@ def exit_status(work: Callable[[], int], place: Callable[[], Any]) -> int:
     return 2
 
 
-def not_empty(name: str, value: Any) -> Any:
+def not_empty(name: str, value: str | os.PathLike) -> str | os.PathLike:
     """The value of an option that names something; UserError if it is empty."""
     if not str(value):
         raise UserError(f"--{name} is empty: name a path, or leave it out")

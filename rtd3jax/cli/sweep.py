@@ -55,10 +55,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     before = _on_termination(_terminate)
     try:
-        return exit_status(lambda: _start(options, arguments), lambda: sweep_options.out(options))
-    except KeyboardInterrupt as interrupt:  # not during the training, after which results follow
-        print("interrupted: repeat the command", file=sys.stderr)
-        return _status_of(interrupt)
+        # Not of interrupts during the training, after which results follow.
+        return exit_status(
+            lambda: _start(options, arguments), lambda: sweep_options.out(options), _status_of
+        )
     finally:
         _on_termination(before)
 

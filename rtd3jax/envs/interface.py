@@ -75,7 +75,7 @@ def describe(env: EnvironmentLike, params: object) -> Interface:
     return found.interface
 
 
-def changes_of_type(what: str, before: Any, after: Any) -> Iterator[tuple[str, str]]:
+def changes_of_type(what: str, before: object, after: object) -> Iterator[tuple[str, str]]:
     """Differences in type between the values of reset and step, each with its remedy.
 
     Args:

@@ -238,7 +238,7 @@ class Checkpoints:
         return longer
 
 
-def same(one: Any, other: Any) -> bool:
+def same(one: object, other: object) -> bool:
     """Whether two JSON-ready values are the same; NaN is the same as NaN."""
     return json.dumps(one, sort_keys=True) == json.dumps(other, sort_keys=True)
 

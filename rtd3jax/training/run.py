@@ -2,7 +2,6 @@
 
 import dataclasses
 import hashlib
-import numbers
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -372,22 +371,19 @@ def check_seeds(seeds: Iterable[int]) -> tuple[int, ...]:
     return tuple(int(seed) for seed in seeds)
 
 
-def as_list(values: Any) -> list[Any] | None:
+def as_list(values: object) -> list[Any] | None:
     """The values of something that can be iterated over; None for anything else."""
-    try:
-        return list(values)
-    except TypeError:
-        return None
+    return list(values) if isinstance(values, Iterable) else None
 
 
-def check_checkpoints(directory: Any, seconds: Any) -> None:
+def check_checkpoints(directory: object, seconds: object) -> None:
     """Raise UserError unless these are a path, and a time in seconds; both may be None."""
     if not (directory is None or isinstance(directory, str | os.PathLike)):
         raise UserError(f"checkpoint_dir must be a path, not {directory!r}")
     if seconds is None:
         return
-    number = isinstance(seconds, numbers.Real) and not isinstance(seconds, bool)
-    if not number or not float(seconds) >= 0:  # also NaN
+    number = float(seconds) if isinstance(seconds, float | int | np.number) else -1.0
+    if isinstance(seconds, bool) or not number >= 0:  # also NaN
         raise UserError(f"checkpoint_seconds must be a number of at least 0, not {seconds!r}")
 
 

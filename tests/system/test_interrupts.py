@@ -52,7 +52,7 @@ def test_commands_end_in_one_line_after_an_interrupt_or_a_closed_pipe(capsys, mo
         raise KeyboardInterrupt
 
     assert common.exit_status(interrupt, lambda: "run") == 130
-    assert capsys.readouterr().err == "interrupted\n"
+    assert capsys.readouterr().err == "interrupted: repeat the command\n"
 
     def broken():
         raise BrokenPipeError(32, "Broken pipe")
