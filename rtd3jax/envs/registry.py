@@ -452,6 +452,11 @@ def _assign(
                 change[name] = _coerce(what, name, value, owned[name])
                 break
         else:
+            if any(hasattr(owner, name) for owner in owners):
+                raise UserError(
+                    f"{what}: the parameter {name!r} is no plain number or tuple of whole numbers, "
+                    f"so it cannot be set by name: pass params=env.default_params.replace(...)"
+                )
             known = [*(field for owned in fields for field in owned), *also]
             raise UserError(
                 f"{what} has no parameter {name!r}{nearest(name, known)} "

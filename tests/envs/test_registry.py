@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import struct
 from gymnax.environments import environment, spaces
 
 from rtd3jax.envs import registry
@@ -348,6 +349,22 @@ def test_what_cannot_be_disturbed_is_not_registered():
     with pytest.raises(UserError, match="Bare has no reset_env"):
         register("bare-plant", Bare())
     assert "bare-plant" not in registry._entries
+
+
+def test_a_parameter_that_is_an_array_is_not_denied():
+    @struct.dataclass
+    class Params:
+        mass: float = np.float32(1.0)
+        max_steps_in_episode: int = 5
+
+    class Heavy(Unlimited):
+        default_params = Params()
+
+    register("heavy-plant", Heavy(), replace=True)
+    with pytest.raises(UserError, match="'mass' is no plain number .* cannot be set by name"):
+        make("heavy-plant", mass=2.0)
+    with pytest.raises(UserError, match="has no parameter 'mess'"):
+        make("heavy-plant", mess=2.0)
 
 
 def test_parameters_of_the_plant_inside_are_refused():
