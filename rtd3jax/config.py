@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Mapping
 from typing import Any, Literal, get_args
 
-from rtd3jax.errors import UserError, nearest
+from rtd3jax.errors import UserError, check_choice, nearest
 from rtd3jax.registries import AGENTS, MEMORIES
 
 Precision = Literal["float32", "bfloat16"]
@@ -259,14 +259,9 @@ class Config:
 
     def _resolve_replay(self) -> None:
         """Set the defaults of ``replay`` and ``acting``, which have no effect without a history."""
-        for name, choices in (("replay", REPLAYS), ("acting", (*ACTINGS, None))):
-            value = getattr(self, name)
-            if value not in choices:
-                named = [choice for choice in choices if choice]
-                raise UserError(
-                    f"{name} {value!r} is unknown{nearest(str(value), named)}; choose "
-                    f"{' or '.join(named)}"
-                )
+        check_choice("replay", self.replay, REPLAYS)
+        if self.acting is not None:
+            check_choice("acting", self.acting, ACTINGS)
         for name in ("burn_in_gradient", "normalise_observations"):
             value = getattr(self, name)
             if not isinstance(value, bool):

@@ -1,7 +1,7 @@
 """The error for mistakes that the user can correct."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 
 class UserError(ValueError):
@@ -12,6 +12,15 @@ def nearest(word: str, choices: Iterable[str]) -> str:
     """Return ``"; did you mean 'x'?"`` for the choice most like ``word``, or ``""`` if none is."""
     matches = difflib.get_close_matches(str(word), [str(c) for c in choices], n=1)
     return f"; did you mean {matches[0]!r}?" if matches else ""
+
+
+def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
+    """Raise UserError unless ``value`` is one of the choices."""
+    if value not in choices:
+        raise UserError(
+            f"{name} {value!r} is unknown{nearest(str(value), choices)}; choose "
+            f"{' or '.join(choices)}"
+        )
 
 
 def first_line(error: BaseException) -> str:

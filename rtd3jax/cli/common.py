@@ -50,9 +50,9 @@ def exit_status(
     return 2
 
 
-def not_empty(name: str, value: str | os.PathLike) -> str | os.PathLike:
-    """The value of an option that names something; UserError if it is empty."""
-    if not str(value):
+def not_empty(name: str, value: str | None) -> str | None:
+    """The value of an option that names a path, or None; UserError if it is empty."""
+    if value == "":
         raise UserError(f"--{name} is empty: name a path, or leave it out")
     return value
 

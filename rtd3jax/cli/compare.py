@@ -30,8 +30,8 @@ def _run(options: argparse.Namespace) -> int:
     settings = differing_settings(directories, names, table)
     text = comparison_markdown(table, names, settings, measure)
     print(text, end="")
-    if options.out is not None:
-        out = user_path(not_empty("out", options.out))
+    if (given := not_empty("out", options.out)) is not None:
+        out = user_path(given)
         if out.exists() and not out.is_dir():
             raise UserError(f"{out} is a file: --out must name a directory")
         write_bytes_atomically(out / "compare.parquet", table.to_parquet(index=False))

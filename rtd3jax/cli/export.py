@@ -31,8 +31,7 @@ def _run(options: argparse.Namespace) -> int:
         disturbance=options.disturbance,
         history_length=options.history_length,
     )
-    given = options.out if options.out is None else not_empty("out", options.out)
-    path = user_path(given or _default_name(policy, options))
+    path = user_path(not_empty("out", options.out) or _default_name(policy, options))
     if options.format == POLICY:
         policy.save(path, overwrite=options.force)
     else:

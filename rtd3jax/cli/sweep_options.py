@@ -190,12 +190,10 @@ def overrides(options: argparse.Namespace) -> dict[str, Any]:
 
 def out(options: argparse.Namespace) -> Path:
     """The run directory."""
-    given: Any = options.out
-    if given is not None:
-        return user_path(not_empty("out", given))
-    if not (options.preset or options.env):
+    given = not_empty("out", options.out)
+    if not (given or options.preset or options.env):
         raise UserError("name the run directory: --out DIR")
-    return user_path(Path("runs") / (options.preset or options.env))
+    return user_path(given or Path("runs") / (options.preset or options.env))
 
 
 def count(name: str, value: int, most: int = 100_000) -> int:

@@ -320,12 +320,7 @@ def warn_if_it_begins_too_late(env: Disturbed) -> None:
     limit = getattr(own.env, "max_steps_in_episode", None)
     if limit is not None and not (is_simulated(env.base) and limit == DEFAULT_STEP_LIMIT):
         return
-    late = [
-        type(process).__name__
-        for channel in CHANNELS
-        for process in _members(getattr(own, channel))
-        if process.begins_later
-    ]
+    late = [type(process).__name__ for process in acting_processes(own) if process.begins_later]
     if late:
         remedy = (
             "pass max_steps_in_episode to rtd.from_gymnasium"
@@ -340,10 +335,16 @@ def warn_if_it_begins_too_late(env: Disturbed) -> None:
         )
 
 
-def _members(process: Process) -> list[Process]:
-    """The processes of which a process consists."""
-    inner = getattr(process, "processes", None)
-    return [process] if inner is None else [one for part in inner for one in _members(part)]
+def acting_processes(params: DisturbedParams) -> list[Process]:
+    """The processes of all channels, without combinations of them and without `NoDisturbance`."""
+
+    def members(process: Process) -> list[Process]:
+        inner = getattr(process, "processes", None)
+        if inner is not None:
+            return [one for part in inner for one in members(part)]
+        return [] if isinstance(process, NoDisturbance) else [process]
+
+    return [one for channel in CHANNELS for one in members(getattr(params, channel))]
 
 
 def sequence(*processes: Process) -> Process:

@@ -19,6 +19,7 @@ from rtd3jax.envs.disturbed import (
     CHANNELS,
     Disturbed,
     DisturbedParams,
+    acting_processes,
     check_composable,
     check_processes,
     disturb,
@@ -186,8 +187,7 @@ def register(
         _entries[env_id] = _Entry(None, cast("Callable[..., Any]", env), {}, module)
         return
     check_gymnax(env)
-    own = env.default_params if isinstance(env, Disturbed) else None
-    if not all(isinstance(getattr(own, name, NoDisturbance()), NoDisturbance) for name in CHANNELS):
+    if isinstance(env, Disturbed) and acting_processes(env.default_params):
         raise UserError(
             f"{env_id!r} is disturbed already, so its undisturbed observations would be unknown: "
             "register the environment itself, and name its processes in disturbances"

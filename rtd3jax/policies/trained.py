@@ -15,7 +15,7 @@ from rtd3jax.agents.memory.base import Carry, Params
 from rtd3jax.agents.networks import Network, act, advance
 from rtd3jax.agents.normalise import Normaliser, as_read
 from rtd3jax.config import ACTINGS, Acting
-from rtd3jax.errors import UserError, nearest
+from rtd3jax.errors import UserError, check_choice
 from rtd3jax.policies.export.formats import writer_of
 from rtd3jax.policies.export.model import Model, fold
 from rtd3jax.registries import AGENTS
@@ -98,7 +98,7 @@ class Policy:
 
     def init(self, key: jax.Array | None = None) -> PolicyState:
         """The state before the first step of an episode; ``key`` is not used."""
-        self._check_acting()
+        check_choice("acting", self.acting, ACTINGS)
         action_size = self.bounds.low.shape[0]
         runs_on = self.acting == "carry"
         return PolicyState(
@@ -109,13 +109,6 @@ class Policy:
             time=jnp.int32(0),
             carry=self.network.zero_carry(1) if runs_on else None,
         )
-
-    def _check_acting(self) -> None:
-        if self.acting not in ACTINGS:
-            raise UserError(
-                f"acting {self.acting!r} is unknown{nearest(str(self.acting), ACTINGS)}; choose "
-                f"{' or '.join(ACTINGS)}"
-            )
 
     def step(self, state: PolicyState, observation: jax.Array) -> tuple[jax.Array, PolicyState]:
         """The action for ``observation`` [O], and the next state, which contains both.
@@ -283,7 +276,7 @@ class Policy:
 
     def _metadata(self) -> dict[str, Any]:
         """The header of a saved policy."""
-        self._check_acting()
+        check_choice("acting", self.acting, ACTINGS)
         return {
             "kind": KIND,
             "format": self._format,

@@ -32,10 +32,10 @@ def _lane_status(
 ) -> dict[str, Any]:
     if lanes.is_done(cell, seed):
         try:
-            arrays = read_arrays(lanes.lane_path(cell, seed))
+            _, metadata = read_arrays(lanes.lane_path(cell, seed))
         except UserError as error:  # one damaged file does not hide the others
             return {"status": "failed", "step": 0, "reason": str(error)}
-        failure = arrays[1]["failure"]
+        failure = metadata["failure"]
         if failure is not None:
             return {"status": "lost", "step": failure["step"], "reason": failure["reason"]}
         return {"status": "done", "step": cell.config.total_steps, "reason": ""}

@@ -88,14 +88,8 @@ class Checkpoints:
     ) -> None:
         """Write a checkpoint of each lane at ``step``; then remove all but the last ``kept``."""
         began = time.monotonic()
-        errors = []
-        for job, state in jobs:
-            try:
-                self._write(job, state, step, kept)
-            except UserError as error:  # the other lanes are written all the same
-                errors.append(error)
-        if errors:
-            raise errors[0]
+        # A lane that cannot be written does not stop the others.
+        _each(lambda lane: self._write(lane[0], lane[1], step, kept), jobs)
         self.note(group, step)
         self._cost[id(group)] = time.monotonic() - began
 
@@ -143,14 +137,7 @@ class Checkpoints:
 
     def save_all(self, groups: Iterable[Any]) -> None:
         """`save_once` for each group; an error is raised after all others are written."""
-        errors = []
-        for group in groups:
-            try:
-                self.save_once(group)
-            except UserError as error:
-                errors.append(error)
-        if errors:
-            raise errors[0]
+        _each(self.save_once, groups)
 
     def restore(self, jobs: list[Any]) -> tuple[list[LaneState], int] | None:
         """The states at the newest step with a valid checkpoint of every lane, and this step.
@@ -241,6 +228,18 @@ class Checkpoints:
 def same(one: object, other: object) -> bool:
     """Whether two JSON-ready values are the same; NaN is the same as NaN."""
     return json.dumps(one, sort_keys=True) == json.dumps(other, sort_keys=True)
+
+
+def _each(write: Callable[[Any], None], items: Iterable[Any]) -> None:
+    """Call ``write`` for every item; raise the first UserError when all were tried."""
+    errors = []
+    for item in items:
+        try:
+            write(item)
+        except UserError as error:
+            errors.append(error)
+    if errors:
+        raise errors[0]
 
 
 def _unwritable(directory: Path, error: OSError, remark: str = "") -> UserError:

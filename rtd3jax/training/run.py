@@ -1,6 +1,7 @@
 """`train`: trains seeds of one configuration, or of several, on one environment."""
 
 import dataclasses
+import functools
 import hashlib
 import os
 from collections.abc import Iterable, Mapping, Sequence
@@ -231,11 +232,13 @@ def _checkpoints(
     env: EnvironmentLike,
     seconds: float | None,
 ) -> Checkpoints:
+    # A recording is digested once, and not at every checkpoint.
+    plant = functools.cache(lambda job: plant_of(env, job.lane.env_params))
+
     def identity(job: Job) -> dict[str, Any]:
         index, seed = job.key
         own = {"start": job.start.where} if job.start is not None else {}
-        plant = plant_of(env, job.lane.env_params)
-        return {**configs[index].to_dict(), **own, **plant, "seed": seed}
+        return {**configs[index].to_dict(), **own, **plant(job), "seed": seed}
 
     return Checkpoints(lambda job: directories[job.cell] / f"seed-{job.seed}", identity, seconds)
 

@@ -9,10 +9,7 @@ import pytest
 from scipy import stats
 from test_reliability import EXPERIMENTS, load
 
-
-@pytest.fixture(autouse=True)
-def leave_the_path_alone(monkeypatch):
-    monkeypatch.setattr(sys, "path", list(sys.path))
+pytestmark = pytest.mark.usefixtures("leave_the_path_alone")
 
 
 def test_verdicts_follow_from_the_numbers():

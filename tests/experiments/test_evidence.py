@@ -15,10 +15,7 @@ from test_reliability import EXPERIMENTS, load
 from rtd3jax.envs.rover_soil.soil import Soil, local_soil
 from rtd3jax.envs.rover_soil.wheel import contact_forces, entry_angle
 
-
-@pytest.fixture(autouse=True)
-def leave_the_path_alone(monkeypatch):
-    monkeypatch.setattr(sys, "path", list(sys.path))
+pytestmark = pytest.mark.usefixtures("leave_the_path_alone")
 
 
 def test_the_rover_experiment_runs_and_says_what_is_missing(tmp_path, capsys):

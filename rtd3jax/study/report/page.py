@@ -1,6 +1,7 @@
 """Writes the page: data, code and style in one HTML document."""
 
 import datetime
+import functools
 import html
 import importlib.resources
 import json
@@ -14,6 +15,7 @@ from rtd3jax.study.ceilings import ceilings_of
 from rtd3jax.study.report.data import study_data, tables_of
 from rtd3jax.study.report.playback import recordings
 from rtd3jax.study.report.robustness import robustness_data
+from rtd3jax.study.report.table import policies_of
 from rtd3jax.study.report.transfer import transfer_data
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.statistics import seed_means
@@ -84,13 +86,14 @@ def page_data(directory: RunDirectory, *, complete: bool, playback: bool) -> dic
     ceilings = ceilings_of(directory.path, directory.cells, compute=complete)
     for environment in data["environments"]:
         environment["ceiling"] = ceilings.get((environment["env"], environment["disturbance"]))
+    policies = functools.cache(lambda: policies_of(directory))  # for both tables
     try:
-        data["transfer"] = transfer_data(directory, notes)
+        data["transfer"] = transfer_data(directory, policies, notes)
     except UserError as error:
         data["transfer"] = None
         notes.append(str(error))
     try:
-        data["robustness"] = robustness_data(directory, notes)
+        data["robustness"] = robustness_data(directory, policies, notes)
     except UserError as error:
         data["robustness"] = None
         notes.append(str(error))

@@ -1,5 +1,6 @@
 """The test of robustness of a study, as data of its page."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,12 +18,14 @@ COLUMNS = (*CELL, "seed", *MEASURED)
 """One row per lane, stress and value: means over the episodes of a lane."""
 
 
-def robustness_data(directory: RunDirectory, notes: list[str]) -> list[dict[str, Any]] | None:
+def robustness_data(
+    directory: RunDirectory, policies: Callable[[], set[str]], notes: list[str]
+) -> list[dict[str, Any]] | None:
     """Each stress of each cell, with a curve over its values; None without a table.
 
-    ``cell`` is an index of the study's cells. ``notes`` receives a line if the study's policies are
-    not those of the table. A curve is the interquartile mean over the seeds, with the
-    bounds of its interval, as of learning curves.
+    ``cell`` is an index of the study's cells. A curve is the interquartile mean over the seeds,
+    with the bounds of its interval, as of learning curves. ``policies`` and ``notes`` are those of
+    `of_these_policies`.
 
     Raises:
         UserError: when the file exists, but is not such a table.
@@ -30,7 +33,7 @@ def robustness_data(directory: RunDirectory, notes: list[str]) -> list[dict[str,
     table = read_table(directory.path / FILE, COLUMNS)
     if table is None:
         return None
-    table = of_these_policies(table, directory, "robustness", notes)
+    table = of_these_policies(table, policies, FILE, "stress", notes)
     if table.empty:
         return None
     return [

@@ -1,6 +1,6 @@
 """Reads the tables that some commands add to a run, for the page."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -8,44 +8,48 @@ import pandas as pd
 from rtd3jax.errors import UserError
 from rtd3jax.study.rundir import RunDirectory
 
-NAMES = {"robustness": "stress"}
-"""Names of commands that differ from those of their tables."""
-
-
 LANE = "lane"
 """The column with the digest of the lane's file, whose policy was tested."""
 
 
-def of_these_policies(
-    table: pd.DataFrame, directory: RunDirectory, name: str, notes: list[str]
-) -> pd.DataFrame:
-    """The rows of the policies that the study has now; a note tells of others, and of policies
-    without rows.
-
-    Args:
-        table: the table of a command that tests policies. An earlier version wrote no column
-            `LANE`; all of its rows are kept.
-        directory: the study.
-        name: the command's name, and that of the table.
-        notes: receives the note.
-    """
-    if LANE not in table:
-        return table
+def policies_of(directory: RunDirectory) -> set[str]:
+    """The digests of the lanes whose policies can be tested."""
     lanes = directory.lanes
-    now = {
+    return {
         lanes.digest(cell, seed)
         for cell in directory.cells
         for seed in directory.seeds
         if lanes.is_done(cell, seed) and not lanes.is_lost(cell, seed)
     }
-    tested = set(table[LANE])
+
+
+def of_these_policies(
+    table: pd.DataFrame,
+    policies: Callable[[], set[str]],
+    file: str,
+    command: str,
+    notes: list[str],
+) -> pd.DataFrame:
+    """The rows of the policies that a study has now.
+
+    Args:
+        table: the table of a command that tests policies. An earlier version wrote no column
+            `LANE`; all of its rows are kept.
+        policies: returns `policies_of` the study, if they are needed.
+        file: the name of the table's file.
+        command: the command that writes it.
+        notes: receives a line about rows of other policies, and one about policies without rows.
+    """
+    if LANE not in table:
+        return table
+    now, tested = policies(), set(table[LANE])
     if others := len(tested - now):
         notes.append(
-            f"{name}.parquet has returns of {others} policies that the study has no longer, which "
-            f"are left out: repeat python -m rtd3jax.{NAMES.get(name, name)}"
+            f"{file} has returns of {others} policies that the study has no longer, which are left "
+            f"out: repeat python -m rtd3jax.{command}"
         )
     if lacking := len(now - tested):
-        notes.append(f"{name}.parquet lacks {lacking} of the study's {len(now)} policies")
+        notes.append(f"{file} lacks {lacking} of the study's {len(now)} policies")
     return table[table[LANE].isin(now)]
 
 

@@ -1,5 +1,6 @@
 """The transfer matrix: returns of trained agents under other disturbances."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,12 @@ COLUMNS = (*_CELL, "seed", "episode", "return")
 """One row per lane, tested disturbance and episode."""
 
 
-def transfer_data(directory: RunDirectory, notes: list[str]) -> list[dict[str, Any]] | None:
+def transfer_data(
+    directory: RunDirectory, policies: Callable[[], set[str]], notes: list[str]
+) -> list[dict[str, Any]] | None:
     """A summary over the seeds for each agent, training and test; None without a table.
 
-    ``notes`` receives a line if the study's policies are not those of the table.
+    ``policies`` and ``notes`` are those of `of_these_policies`.
 
     Raises:
         UserError: when the file exists, but is not such a table.
@@ -26,7 +29,7 @@ def transfer_data(directory: RunDirectory, notes: list[str]) -> list[dict[str, A
     table = read_table(directory.path / FILE, COLUMNS)
     if table is None:
         return None
-    table = of_these_policies(table, directory, "transfer", notes)
+    table = of_these_policies(table, policies, FILE, "transfer", notes)
     if table.empty:
         return None
     table = table.astype({"return": np.float64})
