@@ -23,7 +23,7 @@ def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
         )
 
 
-def first_line(error: BaseException) -> str:
+def short_reason(error: BaseException) -> str:
     """The line of an error's message that says most, or the error's type if there is none.
 
     This is the first line; of a message that holds a traceback, as those of callbacks to the host

@@ -17,7 +17,7 @@ from rtd3jax.agents.history import History, Segment, Steps, Window, flat
 from rtd3jax.agents.memory.base import Carry, Memory, Params, check_memory
 from rtd3jax.agents.parameters import own_parameters
 from rtd3jax.agents.products import matmul
-from rtd3jax.errors import UserError, first_line
+from rtd3jax.errors import UserError, short_reason
 from rtd3jax.registries import MEMORIES
 
 LAYERS = ("encoder", "memory", "current", "head", "output")
@@ -394,7 +394,7 @@ def _check_encoder(module: nn.Module, width: int) -> None:
             lambda: module.init_with_output(jax.random.key(0), _example(module, 2))[0]
         )
     except Exception as error:  # code of a user, which may raise any error
-        raise UserError(f"encoder {name} failed: {first_line(error)}") from error
+        raise UserError(f"encoder {name} failed: {short_reason(error)}") from error
     if (given.shape, given.dtype) != ((2, width), jnp.float32):
         raise UserError(
             f"encoder {name} must return float32 [batch, {width}], not "

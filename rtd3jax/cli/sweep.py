@@ -141,12 +141,22 @@ def _run(options: argparse.Namespace) -> int:
         page=options.report,
         keep=options.keep_checkpoints,
     )
+    complaints: list[str] = []
     with writer(directory.path, shard) as handles:
         if directory.refresh():  # another process has changed the study in the meantime
             jobs = directory.jobs(strategy)
         jobs = _share(jobs, shard, options)
-        trainer = _trainer(options, shares, handles)
-        return _train(directory, jobs, work, options, trainer)
+        references = references_of(directory.cells)
+        train = _trainer(options, shares, handles)
+        with open_loggers(options.log, directory) as logger:
+            try:
+                train(directory, jobs, work, complaints, references, logger)
+                interrupted = 0
+            except KeyboardInterrupt as interrupt:
+                interrupted = _status_of(interrupt)
+    # Without the lock, so that the page does not show lanes that were interrupted as running.
+    finish(directory, references, page=options.report, interrupted=bool(interrupted))
+    return _conclude(directory, complaints, interrupted)
 
 
 def _shard(options: argparse.Namespace) -> tuple[int, int] | None:
@@ -175,22 +185,8 @@ def _trainer(options: argparse.Namespace, shares: Shares, handles: list[int]) ->
     return functools.partial(train_in_processes, **where)
 
 
-def _train(
-    directory: RunDirectory,
-    jobs: list[Job],
-    work: Work,
-    options: argparse.Namespace,
-    train: Trainer,
-) -> int:
-    references = references_of(directory.cells)
-    complaints: list[str] = []
-    interrupted = 0
-    with open_loggers(options.log, directory) as logger:
-        try:
-            train(directory, jobs, work, complaints, references, logger)
-        except KeyboardInterrupt as interrupt:
-            interrupted = _status_of(interrupt)
-    finish(directory, references, page=options.report, interrupted=bool(interrupted))
+def _conclude(directory: RunDirectory, complaints: Sequence[str], interrupted: int) -> int:
+    """Print the summary, and what was lost; return the exit status."""
     print((directory.path / "summary.md").read_text("utf-8"))
     print(f"results: {directory.path}")
     if interrupted:

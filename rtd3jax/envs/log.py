@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rtd3jax.errors import UserError, first_line, nearest
+from rtd3jax.errors import UserError, nearest, short_reason
 from rtd3jax.system.files import user_path
 
 if TYPE_CHECKING:  # importing pandas takes a second
@@ -88,10 +88,10 @@ def _read_table(path: str | os.PathLike) -> "pd.DataFrame":
     except UserError:
         raise
     except OSError as error:
-        reason = error.strerror or first_line(error)
+        reason = error.strerror or short_reason(error)
         raise UserError(f"{path} cannot be read ({reason})") from error
     except Exception as error:  # pandas and Arrow raise many types of errors
-        raise UserError(f"{path} cannot be read as a table ({first_line(error)})") from error
+        raise UserError(f"{path} cannot be read as a table ({short_reason(error)})") from error
 
 
 def _episodes_of_table(

@@ -5,7 +5,7 @@ import numpy as np
 from rtd3jax.envs.description import Ceiling
 from rtd3jax.envs.interface import environment_name
 from rtd3jax.envs.registry import description_of
-from rtd3jax.errors import UserError, first_line
+from rtd3jax.errors import UserError, short_reason
 from rtd3jax.evaluation.rollout import evaluate
 from rtd3jax.protocols import EnvironmentLike
 
@@ -37,7 +37,7 @@ def ceiling(
     except UserError:
         raise
     except Exception as error:  # a user's function may raise any error
-        raise UserError(f"the ceiling of {name} failed: {first_line(error)}") from error
+        raise UserError(f"the ceiling of {name} failed: {short_reason(error)}") from error
     if isinstance(best, Ceiling):
         return best
     returns = np.asarray(evaluate(best, env, episodes, seed), np.float64)

@@ -15,7 +15,7 @@ from rtd3jax.envs.processes.impairment import Impairment
 from rtd3jax.envs.processes.process import Process
 from rtd3jax.envs.registry import description_of
 from rtd3jax.envs.stress import SIGNAL_STRESSES, Stress
-from rtd3jax.errors import UserError, first_line, nearest
+from rtd3jax.errors import UserError, nearest, short_reason
 from rtd3jax.evaluation.rollout import check_counts, unchecked_returns
 from rtd3jax.policies.compatibility import check_compatible, fitted
 from rtd3jax.policies.impaired import ImpairedPolicy
@@ -246,7 +246,7 @@ def _case(nominal: Case) -> Case:
     except UserError as error:
         raise UserError(f"stress {stress.name}={value:g}: {error}") from error
     except Exception as error:  # a user's function may raise any error
-        raise UserError(f"stress {stress.name}={value:g} failed: {first_line(error)}") from error
+        raise UserError(f"stress {stress.name}={value:g} failed: {short_reason(error)}") from error
 
 
 def _is_pair(changed: object) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 
 from rtd3jax.envs.processes.process import Process
 from rtd3jax.envs.rover.slip import WHEELS, Ar1Slip, SineSlip
-from rtd3jax.errors import UserError, first_line
+from rtd3jax.errors import UserError, short_reason
 from rtd3jax.evaluation.style import STYLE
 from rtd3jax.system.files import check_target, write_new
 
@@ -80,7 +80,7 @@ def draw_fit(
             figure.savefig(buffer, format=target.suffix.lstrip(".").lower() or "png")
         except ValueError as error:
             raise UserError(
-                f"{path}: {first_line(error)}; use a name that ends in .png, .svg or .pdf"
+                f"{path}: {short_reason(error)}; use a name that ends in .png, .svg or .pdf"
             ) from error
     write_new(path, buffer.getvalue(), overwrite)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rtd3jax.envs.description import Ceiling
-from rtd3jax.errors import UserError, first_line
+from rtd3jax.errors import UserError, short_reason
 from rtd3jax.evaluation.ceiling import ceiling
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.results import rounded_number
@@ -48,7 +48,7 @@ def compute_ceilings(directory: Path, cells: Sequence[Cell]) -> None:
     try:
         ceilings_of(directory, cells, compute=True)
     except Exception as error:
-        reason = first_line(error)
+        reason = short_reason(error)
         print(f"no ceilings: {reason}", file=sys.stderr)
 
 

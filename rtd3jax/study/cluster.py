@@ -23,7 +23,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from rtd3jax.errors import UserError, first_line
+from rtd3jax.errors import UserError, short_reason
 from rtd3jax.study.derive import Reference
 from rtd3jax.study.execute import Work, train_here, waiting_jobs
 from rtd3jax.study.interim import InterimResults
@@ -127,7 +127,7 @@ def _connected(ray: ModuleType, address: str) -> Iterator[None]:
         _check_listening(address)
         ray.init(address=address, log_to_driver=False, logging_level="ERROR")
     except (OSError, ValueError, OverflowError, RuntimeError) as error:
-        reason = first_line(error)
+        reason = short_reason(error)
         raise UserError(
             f"--cluster {address}: there is no Ray cluster ({reason}); start one with "
             "ray start --head"

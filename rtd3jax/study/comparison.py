@@ -8,10 +8,11 @@ import numpy as np
 import pandas as pd
 
 from rtd3jax.errors import UserError
-from rtd3jax.study.results import CELL, EPISODES, is_trained, read_table
+from rtd3jax.study.results import CELL, is_trained
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.statistics import compare, seed_means, summarise
 from rtd3jax.study.summary import markdown_row, number
+from rtd3jax.study.tables import current_tables
 
 MEASURES = ("return", "true_return")
 
@@ -129,14 +130,13 @@ def comparison_markdown(
 
 def _values(directory: RunDirectory, measure: str) -> dict[tuple, dict[int, float]]:
     """The mean final return of each trained seed, by cell."""
-    path = directory.path / "episodes.parquet"
-    if not path.is_file():
+    episodes = current_tables(directory)["episodes"]
+    lanes = seed_means(episodes[is_trained(episodes)])
+    if lanes.empty:
         raise UserError(
             f"{directory.path} has no results yet: --status prints its state, and its sweep "
-            "writes them"
+            "trains what is missing"
         )
-    episodes = read_table(path, EPISODES)
-    lanes = seed_means(episodes[is_trained(episodes)])
     found: dict[tuple, dict[int, float]] = {}
     for *cell, seed, value in lanes[[*CELL, "seed", measure]].itertuples(index=False, name=None):
         found.setdefault(tuple(cell), {})[int(seed)] = float(value)

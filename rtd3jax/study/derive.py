@@ -9,26 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from rtd3jax.errors import UserError
 from rtd3jax.study.ceilings import ceilings_of
 from rtd3jax.study.figures import final_returns, learning_curves
-from rtd3jax.study.lane_files import LaneFiles
 from rtd3jax.study.lock import deriver
-from rtd3jax.study.plan import Cell
-from rtd3jax.study.results import (
-    CURVES,
-    EPISODES,
-    METRICS,
-    REFERENCE_SEED,
-    read_table,
-    write_table,
-)
+from rtd3jax.study.results import CELL, REFERENCE_SEED, read_table, write_table
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.summary import summary_markdown
-from rtd3jax.system.files import read_arrays, write_bytes_atomically
-
-_CURVE_ARRAYS = ("steps", "returns", "true_returns")
-_FINAL_ARRAYS = ("final_returns", "final_true_returns")
+from rtd3jax.study.tables import SCHEMAS, rows_of_lanes
+from rtd3jax.system.files import write_bytes_atomically
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,69 +40,22 @@ def derive(
 
 
 def _derive(directory: RunDirectory, references: Iterable[Reference], pictures: bool) -> None:
-    curves: list[dict[str, Any]] = []
-    episodes: list[dict[str, Any]] = []
-    failures: list[dict[str, Any]] = []
-    metrics: list[dict[str, Any]] = []
-    for cell in directory.cells:
-        for seed in directory.seeds:
-            if directory.lanes.is_done(cell, seed):
-                _read_lane(directory.lanes, cell, seed, curves, episodes, metrics, failures)
-            elif (reason := directory.lanes.error(cell, seed)) is not None:
-                failures.append(
-                    {**cell.key, "seed": seed, "step": "?", "reason": f"failed: {reason}"}
-                )
+    rows = rows_of_lanes(directory)
     for reference in references:
-        episodes += _reference_rows(reference)
-    write_table(directory.path / "curves.parquet", curves, CURVES)
-    write_table(directory.path / "episodes.parquet", episodes, EPISODES)
-    write_table(directory.path / "metrics.parquet", metrics, METRICS)
-    curve_table = read_table(directory.path / "curves.parquet", CURVES)
-    episode_table = read_table(directory.path / "episodes.parquet", EPISODES)
+        rows.episodes.extend(_reference_rows(reference))
+    tables = {}
+    for name, schema in SCHEMAS.items():
+        path = directory.path / f"{name}.parquet"
+        write_table(path, vars(rows)[name], schema)
+        tables[name] = read_table(path, schema)
     best = ceilings_of(directory.path, directory.cells, compute=False)
-    text = summary_markdown(_excerpt(directory), curve_table, episode_table, failures, best)
+    curves, episodes = tables["curves"], tables["episodes"]
+    planned = {tuple(cell.key[name] for name in CELL): directory.seeds for cell in directory.cells}
+    text = summary_markdown(_excerpt(directory), planned, episodes, rows.failures, best)
     write_bytes_atomically(directory.path / "summary.md", text.encode())
     if pictures:
-        learning_curves(curve_table, episode_table, directory.path, best)
-        final_returns(episode_table, directory.path, best)
-
-
-def _read_lane(
-    lanes: LaneFiles,
-    cell: Cell,
-    seed: int,
-    curves: list[dict[str, Any]],
-    episodes: list[dict[str, Any]],
-    metrics: list[dict[str, Any]],
-    failures: list[dict[str, Any]],
-) -> None:
-    path = lanes.lane_path(cell, seed)
-    row = {**cell.key, "seed": seed}
-    try:
-        arrays, metadata = read_arrays(path)
-        failure = metadata["failure"]
-        points = zip(*(arrays[f"results.{n}"] for n in _CURVE_ARRAYS), strict=True)
-        finals = zip(*(arrays[f"results.{n}"] for n in _FINAL_ARRAYS), strict=True)
-        curves += [
-            {**row, "step": int(step), "return": value, "true_return": true}
-            for step, value, true in points
-        ]
-        episodes += [
-            {**row, "episode": episode, "return": value, "true_return": true}
-            for episode, (value, true) in enumerate(finals)
-        ]
-        metrics += [
-            {**row, "step": int(step), "metric": name.removeprefix("metrics."), "value": value}
-            for name in sorted(arrays)
-            if name.startswith("metrics.")
-            for step, value in zip(arrays["results.steps"], arrays[name], strict=True)
-        ]
-    except (UserError, KeyError, ValueError, TypeError) as error:
-        raise UserError(
-            f"{error}: remove {path} and repeat the command to train this lane again"
-        ) from error
-    if failure is not None:
-        failures.append({**row, **failure})
+        learning_curves(curves, episodes, directory.path, best)
+        final_returns(episodes, directory.path, best)
 
 
 def _excerpt(directory: RunDirectory) -> dict[str, object]:

@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
-from rtd3jax.errors import UserError, first_line
+from rtd3jax.errors import UserError, short_reason
 from rtd3jax.study.lane_files import cell_name
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.rundir import RunDirectory
@@ -224,7 +224,7 @@ class _Several:
     def _warn(name: str, error: Exception) -> None:
         print(
             f"warning: --log {name} failed and gets no more rows; training continues: "
-            f"{first_line(error)}",
+            f"{short_reason(error)}",
             file=sys.stderr,
         )
 
@@ -256,7 +256,7 @@ def open_loggers(names: Sequence[str], directory: RunDirectory) -> Iterator[Logg
         try:
             loggers[name] = LOGGERS[name][1](directory)
         except Exception as error:
-            raise UserError(f"--log {name} cannot be opened: {first_line(error)}") from error
+            raise UserError(f"--log {name} cannot be opened: {short_reason(error)}") from error
     logger = _Several(loggers)
     try:
         yield logger

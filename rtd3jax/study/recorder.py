@@ -5,7 +5,7 @@ import time
 
 import numpy as np
 
-from rtd3jax.errors import first_line
+from rtd3jax.errors import short_reason
 from rtd3jax.evaluation.rollout import both_returns
 from rtd3jax.study.interim import InterimResults
 from rtd3jax.study.log import LOG, append_rows, repair_log
@@ -51,7 +51,7 @@ class Recorder:
     def update(self, group: Group) -> None:
         """Record a chunk of ``group``, its end, or its error."""
         if group.error is not None:
-            reason = first_line(group.error)
+            reason = short_reason(group.error)
             for job in group.jobs:
                 cell, seed = job.key
                 self._directory.lanes.write_error(cell, seed, reason)

@@ -7,7 +7,7 @@ import numpy as np
 
 from rtd3jax.envs.compat.simulated import is_simulated
 from rtd3jax.envs.registry import description_of
-from rtd3jax.errors import UserError, first_line
+from rtd3jax.errors import UserError, short_reason
 from rtd3jax.evaluation.rollout import both_returns
 from rtd3jax.policies.baselines import constant_policy, random_policy
 from rtd3jax.registries import AGENTS
@@ -43,7 +43,7 @@ def references_on(cell: Cell) -> list[Reference]:
         except UserError:
             raise
         except Exception as error:  # a user's function may raise any error
-            reason = first_line(error)
+            reason = short_reason(error)
             raise UserError(f"the baseline {name!r} of {cell.env} failed: {reason}") from error
     episodes = SIMULATED_EPISODES if is_simulated(env) else EPISODES
     return [

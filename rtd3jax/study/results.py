@@ -96,6 +96,11 @@ def write_table(
     write_bytes_atomically(path, buffer.getvalue())
 
 
+def frame(rows: Iterable[Mapping], schema: pa.Schema) -> pd.DataFrame:
+    """A DataFrame as `read_table` returns it, [rows, columns], of rows in memory."""
+    return _as_table(rows, schema).to_pandas()
+
+
 def read_table(path: str | os.PathLike, schema: pa.Schema | None = None) -> pd.DataFrame:
     """Read a file of ``write_table`` as a DataFrame [rows, columns].
 

@@ -9,6 +9,7 @@ study.run()
 study.tables()["episodes"].groupby("algorithm")["return"].mean()
 """
 
+import contextlib
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -28,9 +29,9 @@ from rtd3jax.study.memory_plan import lanes_at_once, usable_memory
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.references import references_of
 from rtd3jax.study.report.page import write_page
-from rtd3jax.study.results import CURVES, EPISODES, METRICS, read_table
 from rtd3jax.study.rundir import RunDirectory, holds_study
 from rtd3jax.study.status import ledger
+from rtd3jax.study.tables import current_tables
 from rtd3jax.system.files import user_path
 from rtd3jax.training.lanes import workers
 from rtd3jax.training.run import check_seeds, check_strategy
@@ -106,7 +107,8 @@ class Study:
         if news := directory.prepare():
             print(news)
         complaints: list[str] = []
-        with writer(directory.path, None):
+        with contextlib.ExitStack() as held:
+            held.enter_context(writer(directory.path, None))
             if directory.refresh():  # another process has changed the study in the meantime
                 jobs = directory.jobs(strategy)
             at_once = lanes_at_once(jobs, strategy, len(workers()), usable_memory())
@@ -119,6 +121,7 @@ class Study:
                     train_here(directory, jobs, work, complaints, references, logger)
                 ended = True
             finally:
+                held.close()  # else the page shows lanes that were interrupted as running
                 finish(directory, references, page=page, interrupted=not ended)
         return complaints
 
@@ -132,11 +135,10 @@ class Study:
         Raises:
             UserError: when no lane has ended yet.
         """
-        schemas = {"curves": CURVES, "episodes": EPISODES, "metrics": METRICS}
-        return {
-            name: read_table(self.path / f"{name}.parquet", schema)
-            for name, schema in schemas.items()
-        }
+        tables = current_tables(self._directory)
+        if all(table.empty for table in tables.values()):
+            raise UserError(f"{self.path} has no results yet: run() trains its lanes")
+        return tables
 
     def figures(self) -> list[Path]:
         """Draw learning curves and final returns again; return the paths of the figures."""

@@ -15,19 +15,20 @@ MISSING = "missing"
 
 def summary_markdown(
     config_lines: Mapping[str, object],
-    curves: pd.DataFrame,
+    seeds: Mapping[tuple, Sequence[int]],
     episodes: pd.DataFrame,
     failures: Sequence[Mapping],
     ceilings: Mapping[tuple[str, str], Mapping[str, Any]] | None = None,
 ) -> str:
     """Summarise a study.
 
-    ``config_lines`` maps names of settings to values, in the order of the summary. ``curves`` and
-    ``episodes`` have the columns of CURVES and EPISODES. Each of ``failures`` has the entries env,
-    disturbance, algorithm, history_length, seed, step and reason. ``ceilings`` are the known
-    ceilings of `rtd3jax.study.ceilings`.
+    ``config_lines`` maps names of settings to values, in the order of the summary. ``seeds`` are
+    the seeds of each cell (env, disturbance, algorithm, history length) of the study. ``episodes``
+    has the columns of EPISODES. Each of ``failures`` has the entries env, disturbance, algorithm,
+    history_length, seed, step and reason. ``ceilings`` are the known ceilings of
+    `rtd3jax.study.ceilings`.
 
-    Every cell of any argument gets a row, so a cell whose seeds were all lost is visible.
+    Every cell of the study gets a row, so a cell whose seeds were all lost is visible.
     """
     lanes = seed_means(episodes)
     lines = ["# Study summary", "", "## Configuration", ""]
@@ -35,43 +36,24 @@ def summary_markdown(
     lines += ["", "## Final returns", ""]
     lines += [
         "Over seeds: mean ± standard deviation, and the interquartile mean (IQM) with its 95 % "
-        "bootstrap interval. Seeds are finished / started. Best IQM first. Reference policies "
+        "bootstrap interval. Seeds are finished / planned. Best IQM first. Reference policies "
         "are not trained; their deviation is over episodes. The ceiling is the best possible mean, "
         "with its standard error.",
         "",
     ]
-    started = _started_seeds(curves, lanes, failures)
-    tasks = {cell[:2] for cell in started}
+    tasks = {cell[:2] for cell in seeds}
     tasks |= set(zip(lanes["env"], lanes["disturbance"], strict=True))
     for task in sorted(tasks):
-        lines += _task_section(task, started, lanes, episodes, (ceilings or {}).get(task, {}))
+        lines += _task_section(task, seeds, lanes, episodes, (ceilings or {}).get(task, {}))
     if not tasks:
         lines += ["No results.", ""]
     lines += ["## Lanes lost", ""] + _failure_lines(failures)
     return "\n".join(lines) + "\n"
 
 
-def _started_seeds(
-    curves: pd.DataFrame, lanes: pd.DataFrame, failures: Sequence[Mapping]
-) -> dict[tuple, set[int]]:
-    """The seeds in any table, by cell (env, disturbance, algorithm, history length)."""
-    started: dict[tuple, set[int]] = {}
-    columns = [*CELL, "seed"]
-    for table in (curves[columns].drop_duplicates(), lanes.loc[is_trained(lanes), columns]):
-        for env, disturbance, algorithm, length, seed in table.itertuples(index=False):
-            cell = (env, disturbance, algorithm, int(length))
-            started.setdefault(cell, set()).add(int(seed))
-    for failure in failures:
-        # An incomplete record still appears under "Lanes lost".
-        if all(name in failure for name in columns):
-            cell = tuple(failure[name] for name in CELL[:3]) + (int(failure["history_length"]),)
-            started.setdefault(cell, set()).add(int(failure["seed"]))
-    return started
-
-
 def _task_section(
     task: tuple[str, str],
-    started: Mapping[tuple, set[int]],
+    seeds: Mapping[tuple, Sequence[int]],
     lanes: pd.DataFrame,
     episodes: pd.DataFrame,
     best: Mapping[str, Any],
@@ -89,18 +71,18 @@ def _task_section(
     ]
 
     rows = []
-    for cell in started:
+    for cell, planned in seeds.items():
         if cell[:2] != task:
             continue
         _, _, algorithm, length = cell
         chosen = of_task["algorithm"].eq(algorithm) & of_task["history_length"].eq(length)
         summary = summarise(of_task.loc[chosen, "return"])
         true = summarise(of_task.loc[chosen, "true_return"])
-        seeds = f"{summary.n} / {len(started[cell])}"
+        finished = f"{summary.n} / {len(planned)}"
         if summary.n == 0:
-            entries = [algorithm, length, seeds, MISSING, MISSING]
+            entries = [algorithm, length, finished, MISSING, MISSING]
         else:
-            entries = [algorithm, length, seeds, _spread(summary), _interval(summary)]
+            entries = [algorithm, length, finished, _spread(summary), _interval(summary)]
         entries += [_spread(true) if true.n else MISSING] if differs else []
         order = (summary.n == 0, -summary.iqm if summary.n else 0.0, algorithm, length)
         rows.append((order, entries))

@@ -12,7 +12,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from rtd3jax.errors import UserError, first_line
+from rtd3jax.errors import UserError, short_reason
 
 _ENTRY = "rtd3jax"
 
@@ -26,7 +26,7 @@ def user_path(path: str | os.PathLike) -> Path:
     try:
         return Path(path).expanduser()
     except RuntimeError as error:
-        raise UserError(f"{path}: {first_line(error)}; write the whole path") from error
+        raise UserError(f"{path}: {short_reason(error)}; write the whole path") from error
 
 
 def write_bytes_atomically(path: str | os.PathLike, data: bytes) -> None:
@@ -111,9 +111,11 @@ def read_arrays(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], Any]:
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         metadata, digest = entry["about"], entry["sha256"]
     except OSError as error:
-        raise UserError(f"{path} cannot be read ({error.strerror or first_line(error)})") from error
+        raise UserError(
+            f"{path} cannot be read ({error.strerror or short_reason(error)})"
+        ) from error
     except (SafetensorError, KeyError, ValueError, TypeError) as error:
-        raise UserError(f"{path} cannot be read ({first_line(error)})") from error
+        raise UserError(f"{path} cannot be read ({short_reason(error)})") from error
     if digest != _digest(arrays, metadata):
         raise UserError(f"{path} is damaged: its checksum does not agree")
     return arrays, metadata
@@ -129,7 +131,7 @@ def read_metadata(path: str | os.PathLike) -> Any:
         with safe_open(user_path(path), "numpy") as file:
             return json.loads((file.metadata() or {})[_ENTRY])["about"]
     except (OSError, SafetensorError, KeyError, ValueError, TypeError) as error:
-        raise UserError(f"{path} cannot be read ({first_line(error)})") from error
+        raise UserError(f"{path} cannot be read ({short_reason(error)})") from error
 
 
 def flatten(tree: object, prefix: str = "") -> dict[str, np.ndarray]:

@@ -8,7 +8,7 @@ import os
 
 import jax
 
-from rtd3jax.errors import UserError, first_line
+from rtd3jax.errors import UserError, short_reason
 
 _GUARDS = ("", "_host_to_device", "_device_to_device", "_device_to_host")
 _FORBIDDING = ("disallow", "disallow_explicit")
@@ -42,7 +42,7 @@ def _import_gymnax() -> None:
     except (RuntimeError, AssertionError) as error:
         platforms = os.environ.get("JAX_PLATFORMS") or jax.config.values.get("jax_platforms")
         raise UserError(
-            f"JAX finds no device with JAX_PLATFORMS={platforms or ''} ({first_line(error)}); "
+            f"JAX finds no device with JAX_PLATFORMS={platforms or ''} ({short_reason(error)}); "
             "unset it, or install JAX for that platform (rtd3jax[cuda13] for NVIDIA GPUs)"
         ) from None
 

@@ -9,14 +9,13 @@ import numpy as np
 import pandas as pd
 import pytest
 from browser import chromium
-from random_policies import random_policy
+from made_run import STEPS, make_run
 
 import rtd3jax as rtd
 from rtd3jax import report, stress, transfer
 from rtd3jax.envs.description import Ceiling
 from rtd3jax.study import ceilings
-from rtd3jax.study.derive import Reference, derive
-from rtd3jax.study.plan import Grid, make_cells
+from rtd3jax.study.plan import Grid
 from rtd3jax.study.report.page import page_data
 from rtd3jax.study.report.playback import record_episodes
 from rtd3jax.study.rundir import RunDirectory
@@ -27,34 +26,6 @@ GRIDS = {
     "rover": Grid("rover", ("ar1-slip", "sine-slip+dropout:p=0.3"), AGENTS, (1, 2)),
     "pendulum": Grid("pendulum", ("random-sine",), AGENTS, (1, 2)),
 }
-STEPS = [20, 40, 60]
-
-
-def make_run(out, grid):
-    """A finished run of untrained agents with invented curves: nothing is compiled for it."""
-    settings = {"total_steps": 60, "hidden_size": 8, "eval_every": 20, "batch_size": 8}
-    settings |= {"learning_starts": 10}
-    directory = RunDirectory(out, make_cells([grid], settings), [0, 1], 2)
-    chance = np.random.default_rng(0)
-    for cell in directory.cells:
-        for seed in directory.seeds:
-            length = cell.config.history_length
-            policy = random_policy(cell.config.algorithm, cell.make_env(), length=length, seed=seed)
-            curves = {"steps": np.array(STEPS), "returns": chance.normal(-3, 1, 3)}
-            final = chance.normal(-2, 1, 2)
-            curves |= {"true_returns": curves["returns"], "final_returns": final}
-            curves |= {"final_true_returns": final}
-            metrics = {"critic_loss": np.array([np.nan, 2.0 + seed, 1.0], np.float32)}
-            interface = policy.interface()
-            directory.lanes.write_lane(
-                cell, seed, policy.parameters(), curves, metrics, None, interface
-            )
-    chance = np.random.default_rng(1)
-    references = [
-        Reference(env, disturbance, "random", *chance.normal(-4, 1, (2, 3)))
-        for env, disturbance in {(cell.env, cell.disturbance): 0 for cell in directory.cells}
-    ]
-    derive(directory, references, pictures=False)
 
 
 @pytest.fixture(scope="module")
@@ -204,7 +175,7 @@ def test_an_unfinished_run_has_a_page_that_says_so(runs, tmp_path, monkeypatch):
     assert "<script>alert" not in page
     data = data_of(hostile)
     assert data["status"] == {"planned": 12}
-    assert any("curves.parquet" in note for note in data["notes"])
+    assert data["notes"][0] == "no lane has ended yet"
     assert data["transfer"] is None and data["playback"] == []
 
 

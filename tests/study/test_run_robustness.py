@@ -6,7 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 from browser import chromium
-from test_report import data_of, make_run
+from made_run import make_run
+from test_report import data_of
 
 import rtd3jax as rtd
 from rtd3jax import stress

@@ -5,6 +5,9 @@ import pytest
 
 import rtd3jax as rtd
 from rtd3jax import sweep
+from rtd3jax.cli import sweep as sweep_module
+from rtd3jax.study import study as study_module
+from rtd3jax.study.lock import is_held
 
 TINY = dict(
     total_steps=60,
@@ -94,3 +97,31 @@ def test_cells_whose_files_would_have_one_name_are_refused(tmp_path):
         with pytest.raises(rtd.UserError, match="would have the same name"):
             rtd.Study([rtd.Cell(*two, rtd.Config("td3")) for two in pair], out=tmp_path / "study")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("how", ["study", "sweep"])
+def test_after_an_interrupt_the_page_does_not_say_that_lanes_are_running(
+    how, tmp_path, monkeypatch
+):
+    """The page reads from the lock whether a process trains lanes."""
+    held = []
+
+    def interrupt(*_, **__):
+        held.append(is_held(tmp_path / "run"))
+        raise KeyboardInterrupt
+
+    def finish(directory, *_, interrupted, **__):
+        assert interrupted
+        held.append(is_held(directory.path))
+        (directory.path / "summary.md").write_text("")
+
+    module = {"study": study_module, "sweep": sweep_module}[how]
+    monkeypatch.setattr(module, "train_here", interrupt)
+    monkeypatch.setattr(module, "finish", finish)
+    if how == "study":
+        with pytest.raises(KeyboardInterrupt):
+            rtd.Study(_cells(), seeds=[0], out=tmp_path / "run").run(quiet=True)
+    else:
+        command = "--env rover --disturbances ar1-slip --algorithms td3 --history-lengths 1 --seeds"
+        assert sweep.main([*command.split(), "1", "--out", str(tmp_path / "run")]) == 130
+    assert held == [True, False]

@@ -4,6 +4,7 @@ import math
 
 import pandas as pd
 
+from rtd3jax.study.results import CELL
 from rtd3jax.study.statistics import summarise
 from rtd3jax.study.summary import summary_markdown
 
@@ -37,11 +38,16 @@ def failure(algorithm="td3", length=0, seed=0, reason="loss is nan", step=400):
     }
 
 
-def render(episode_rows, failures=(), curve_rows=(), config=None):
-    columns = list(rows("td3", 0, [0.0])[0])
-    episodes = pd.DataFrame(episode_rows, columns=columns)
-    curves = pd.DataFrame(list(curve_rows), columns=columns).rename(columns={"episode": "step"})
-    return summary_markdown(config or {}, curves, episodes, list(failures))
+def render(episode_rows, failures=(), planned=None, config=None):
+    """The summary; by default, the study has the lanes of the episodes and failures."""
+    episodes = pd.DataFrame(episode_rows, columns=list(rows("td3", 0, [0.0])[0]))
+    if planned is None:
+        planned = {}
+        for row in [*episode_rows, *failures]:
+            if row["seed"] >= 0:
+                cell = tuple(row[name] for name in CELL)
+                planned.setdefault(cell, set()).add(row["seed"])
+    return summary_markdown(config or {}, planned, episodes, list(failures))
 
 
 def table(text, heading):
@@ -112,10 +118,15 @@ def test_a_cell_known_only_from_a_failure_is_shown_as_missing():
     assert row == ["lstm-td3", "5", "0 / 1", "missing", "missing"]
 
 
-def test_a_cell_known_only_from_its_curves_is_shown_as_missing():
-    text = render([], curve_rows=rows("h-td3", 3, [1.0, 2.0]))
+def test_a_cell_of_which_no_lane_has_ended_is_shown_as_missing():
+    text = render([], planned={("pendulum", "none", "h-td3", 3): range(2)})
     (row,) = table(text, "pendulum, none")
     assert row == ["h-td3", "3", "0 / 2", "missing", "missing"]
+
+
+def test_the_counts_include_lanes_that_have_not_ended():
+    text = render(rows("td3", 0, [1.0, 2.0]), planned={("pendulum", "none", "td3", 0): range(5)})
+    assert table(text, "pendulum, none")[0][2] == "2 / 5"
 
 
 def test_a_cell_with_only_nan_returns_is_shown_as_missing():
@@ -155,10 +166,10 @@ def test_an_empty_study_still_has_a_summary():
 def test_the_ceiling_is_the_last_row_where_it_is_known():
     columns = list(rows("td3", 0, [0.0])[0])
     episodes = pd.DataFrame(rows("td3", 0, [-3.0]), columns=columns)
-    curves = pd.DataFrame(columns=columns).rename(columns={"episode": "step"})
+    planned = {("pendulum", "none", "td3", 0): [0]}
 
     def last(best):
-        text = summary_markdown({}, curves, episodes, [], {("pendulum", "none"): best})
+        text = summary_markdown({}, planned, episodes, [], {("pendulum", "none"): best})
         return table(text, "pendulum, none")[-1]
 
     exact = {"mean": -1.206, "error": 0.001, "kind": "exact"}

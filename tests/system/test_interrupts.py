@@ -65,11 +65,11 @@ def test_commands_end_in_one_line_after_an_interrupt_or_a_closed_pipe(capsys, mo
 
 
 def test_the_last_line_of_a_traceback_says_most():
-    from rtd3jax.errors import first_line
+    from rtd3jax.errors import short_reason
 
     callback = RuntimeError(
         "INTERNAL: callback: Traceback (most recent call last):\n  File x\nOSError: no licence\n"
     )
-    assert first_line(callback) == "OSError: no licence"
-    assert first_line(ValueError("first\nsecond")) == "first"
-    assert first_line(ValueError()) == "ValueError"
+    assert short_reason(callback) == "OSError: no licence"
+    assert short_reason(ValueError("first\nsecond")) == "first"
+    assert short_reason(ValueError()) == "ValueError"

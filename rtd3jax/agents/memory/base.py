@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from rtd3jax.errors import UserError, first_line
+from rtd3jax.errors import UserError, short_reason
 from rtd3jax.registries import MEMORIES
 
 Params = dict[str, Any]
@@ -130,7 +130,7 @@ def check_memory(name: str, memory: Memory) -> None:
         try:
             return jax.eval_shape(call, *arguments)
         except Exception as error:  # code of a user, which may raise any error
-            raise UserError(f"memory {name!r} failed in {what}: {first_line(error)}") from error
+            raise UserError(f"memory {name!r} failed in {what}: {short_reason(error)}") from error
 
     carry = trace("zero", lambda: memory.zero(batch))
     for leaf in jax.tree.leaves(carry):

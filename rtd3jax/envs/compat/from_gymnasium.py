@@ -11,7 +11,7 @@ import gymnasium
 from rtd3jax.envs.compat.simulated_environment import FromGymnasium
 from rtd3jax.envs.compat.simulator import Fleet, say
 from rtd3jax.envs.compat.surface import surface_of
-from rtd3jax.errors import UserError, first_line, nearest
+from rtd3jax.errors import UserError, nearest, short_reason
 
 PREFIX = "gymnasium:"
 """Before an id of Gymnasium's where an environment is named."""
@@ -91,7 +91,7 @@ def _example(make: Callable[[], Any], env: object, title: str) -> gymnasium.Env:
         example = make()
     except (gymnasium.error.DependencyNotInstalled, ImportError) as error:
         raise UserError(
-            f"{title} needs a package that is missing ({first_line(error)}): "
+            f"{title} needs a package that is missing ({short_reason(error)}): "
             "pip install 'rtd3jax[mujoco]' for those of MuJoCo"
         ) from error
     except gymnasium.error.UnregisteredEnv as error:
@@ -100,7 +100,7 @@ def _example(make: Callable[[], Any], env: object, title: str) -> gymnasium.Env:
             "import the module that registers it (--import in a sweep)"
         ) from error
     except Exception as error:
-        reason = f"{type(error).__name__}: {first_line(error)}"
+        reason = f"{type(error).__name__}: {short_reason(error)}"
         raise UserError(f"{title} cannot be made: {reason}") from error
     if isinstance(example, gymnasium.vector.VectorEnv):
         _close(example)
@@ -121,4 +121,5 @@ def _close(example: gymnasium.Env | gymnasium.vector.VectorEnv) -> None:
     try:
         example.close()
     except Exception as error:
-        say(f"close of {type(example).__name__} raised {type(error).__name__}: {first_line(error)}")
+        name, reason = type(example).__name__, short_reason(error)
+        say(f"close of {name} raised {type(error).__name__}: {reason}")

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from jax.typing import ArrayLike
 
-from rtd3jax.errors import UserError, first_line
+from rtd3jax.errors import UserError, short_reason
 
 MOST = 1_024
 """Simulators that are open at once, before the one that was used longest ago is closed."""
@@ -149,14 +149,16 @@ class Simulator:
         except UserError as error:
             raise self.failed(str(error)) from error
         except BaseException as error:
-            message = f"{type(error).__name__}: {first_line(error)}"
+            message = f"{type(error).__name__}: {short_reason(error)}"
             raise self.failed(f"{what} raised {message}") from error
 
     def _observation(self, what: str, observation: object) -> np.ndarray:
         try:
             flat = self._read(observation)
         except (TypeError, ValueError, KeyError, IndexError) as error:
-            raise self.failed(f"the observation of {what} is unfit: {first_line(error)}") from None
+            raise self.failed(
+                f"the observation of {what} is unfit: {short_reason(error)}"
+            ) from None
         if not np.isfinite(flat).all():
             where = int(np.argmin(np.isfinite(flat)))
             raise self.failed(f"element {where} of the observation of {what} is {flat[where]}")

@@ -9,7 +9,7 @@ from flax import struct
 
 from rtd3jax.envs.identity import strong
 from rtd3jax.envs.interface import foreign_code
-from rtd3jax.errors import UserError, first_line
+from rtd3jax.errors import UserError, short_reason
 
 _UNTRACEABLE = (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)
 
@@ -34,7 +34,7 @@ class FunctionPolicy:
         except _UNTRACEABLE as error:
             raise UserError(
                 f"{name} cannot be compiled: use jnp.where for branches, and jax.numpy "
-                f"({first_line(error)})"
+                f"({short_reason(error)})"
             ) from error
         if not isinstance(returned, tuple) or len(returned) != 2:
             raise UserError(f"{name} must return (action, state), not {type(returned).__name__}")
@@ -73,5 +73,5 @@ def function_policy(
     try:
         return FunctionPolicy(strong(state), function)
     except TypeError as error:
-        reason = first_line(error)
+        reason = short_reason(error)
         raise UserError(f"the state of a function_policy holds arrays: {reason}") from error

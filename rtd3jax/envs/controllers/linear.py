@@ -13,7 +13,7 @@ from rtd3jax.envs.controllers.vectors import vector
 from rtd3jax.envs.disturbed import Disturbed, DisturbedState, seen_elements
 from rtd3jax.envs.identity import strong
 from rtd3jax.envs.interface import Interface, environment_name, foreign_code
-from rtd3jax.errors import UserError, first_line
+from rtd3jax.errors import UserError, short_reason
 from rtd3jax.protocols import EnvironmentLike
 
 
@@ -86,7 +86,7 @@ def linearised(
         raise
     except Exception as error:  # code of an environment may raise anything
         raise UserError(
-            f"lqr_policy: {name} could not be linearised: {first_line(error)}"
+            f"lqr_policy: {name} could not be linearised: {short_reason(error)}"
         ) from error
     a, b, c_a, c_b = (np.asarray(m, np.float64) for m in (a, b, c_a, c_b))
     if not np.abs(b).max() > 0:

@@ -15,7 +15,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from rtd3jax.agents.memory.base import Params
-from rtd3jax.errors import UserError, first_line
+from rtd3jax.errors import UserError, short_reason
 from rtd3jax.policies.export.model import Model, carry_shapes
 from rtd3jax.system.files import array_bytes, read_arrays
 
@@ -206,6 +206,6 @@ def load_stablehlo(path: str | os.PathLike) -> StableHlo:
     try:
         exported = jax.export.deserialize(bytearray(arrays["program"].tobytes()))
     except Exception as error:  # JAX raises many types of errors here
-        reason = first_line(error)
+        reason = short_reason(error)
         raise UserError(f"{path} cannot be read by this version of JAX ({reason})") from error
     return StableHlo(metadata, exported)

@@ -9,6 +9,7 @@ import json
 import math
 import re
 from collections import Counter
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -19,16 +20,7 @@ from rtd3jax.errors import UserError
 from rtd3jax.study.colours import colour_of, ordered
 from rtd3jax.study.log import LOG, lane_of, read_log, steps_reached
 from rtd3jax.study.plan import Cell
-from rtd3jax.study.results import (
-    CELL,
-    CURVES,
-    EPISODES,
-    METRICS,
-    is_trained,
-    read_table,
-    reference_names,
-    rounded_number,
-)
+from rtd3jax.study.results import CELL, is_trained, reference_names, rounded_number
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.statistics import Summary, iqm_bands, summarise
 from rtd3jax.study.status import ledger
@@ -41,16 +33,18 @@ MEASURES = {"return": "as rewarded", "true_return": "of the true state"}
 
 def study_data(
     directory: RunDirectory,
-    curves: pd.DataFrame,
-    episodes: pd.DataFrame,
-    metrics: pd.DataFrame,
+    tables: Mapping[str, pd.DataFrame],
     lanes: pd.DataFrame,
     notes: list[str],
 ) -> dict[str, Any]:
     """All data except ceilings, transfer, robustness and playback.
 
-    Missing data add a line to ``notes``. ``lanes`` are the `seed_means` of ``episodes``.
+    Missing data add a line to ``notes``. ``tables`` are those of `current_tables`, and ``lanes``
+    are the `seed_means` of the episodes.
     """
+    curves, episodes, metrics = (tables[name] for name in ("curves", "episodes", "metrics"))
+    if curves.empty and not is_trained(lanes).any():
+        notes.append("no lane has ended yet")
     log = read_log(directory.path / LOG)
     curves = _with_log(curves, log, directory)
     environments = list(dict.fromkeys((cell.env, cell.disturbance) for cell in directory.cells))
@@ -100,25 +94,6 @@ def study_data(
         "timing": _timing(log, directory),
         "made_with": _made_with(directory),
     }
-
-
-def tables_of(
-    directory: RunDirectory, notes: list[str]
-) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
-    """Learning curves, final episodes and metrics; empty tables if there are none yet."""
-    tables = []
-    for name, schema in (("curves", CURVES), ("episodes", EPISODES)):
-        try:
-            tables.append(read_table(directory.path / f"{name}.parquet", schema))
-        except UserError as error:
-            reason = f"there is no {name}.parquet yet"
-            notes.append(reason if "no results table" in str(error) else str(error))
-            tables.append(schema.empty_table().to_pandas())
-    try:
-        tables.append(read_table(directory.path / "metrics.parquet", METRICS))
-    except UserError:  # runs of earlier versions have no metrics
-        tables.append(METRICS.empty_table().to_pandas())
-    return tables[0], tables[1], tables[2]
 
 
 def _with_log(

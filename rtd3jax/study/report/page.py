@@ -10,15 +10,16 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from rtd3jax.errors import UserError, first_line
+from rtd3jax.errors import UserError, short_reason
 from rtd3jax.study.ceilings import ceilings_of
-from rtd3jax.study.report.data import study_data, tables_of
+from rtd3jax.study.report.data import study_data
 from rtd3jax.study.report.playback import recordings
 from rtd3jax.study.report.robustness import robustness_data
 from rtd3jax.study.report.table import policies_of
 from rtd3jax.study.report.transfer import transfer_data
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.statistics import seed_means
+from rtd3jax.study.tables import current_tables
 from rtd3jax.system.files import user_path, write_bytes_atomically
 from rtd3jax.system.versions import versions_of
 
@@ -73,16 +74,16 @@ def refresh_page(directory: RunDirectory, *, complete: bool) -> None:
     try:
         write_page(directory, complete=complete)
     except Exception as error:
-        reason = first_line(error)
+        reason = short_reason(error)
         print(f"{NAME} was not written: {reason}", file=sys.stderr)
 
 
 def page_data(directory: RunDirectory, *, complete: bool, playback: bool) -> dict[str, Any]:
     """The data of the page."""
     notes: list[str] = []
-    curves, episodes, metrics = tables_of(directory, notes)
-    lanes = seed_means(episodes)
-    data = study_data(directory, curves, episodes, metrics, lanes, notes)
+    tables = current_tables(directory, notes)
+    lanes = seed_means(tables["episodes"])
+    data = study_data(directory, tables, lanes, notes)
     ceilings = ceilings_of(directory.path, directory.cells, compute=complete)
     for environment in data["environments"]:
         environment["ceiling"] = ceilings.get((environment["env"], environment["disturbance"]))

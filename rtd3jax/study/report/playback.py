@@ -18,7 +18,7 @@ from rtd3jax.envs.description import Drawing
 from rtd3jax.envs.disturbed import Disturbed, seen_elements
 from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT
 from rtd3jax.envs.registry import description_of
-from rtd3jax.errors import UserError, first_line
+from rtd3jax.errors import UserError, short_reason
 from rtd3jax.evaluation.episode import element_names, play_episodes
 from rtd3jax.protocols import EnvironmentLike, PolicyLike
 from rtd3jax.study.plan import Cell
@@ -113,7 +113,7 @@ def _recorded(
     except UserError:
         raise
     except Exception as error:  # a user's environment may raise any error
-        raise UserError(first_line(error)) from error
+        raise UserError(short_reason(error)) from error
     cut = limit > MOST_STEPS and not frames["done"].any(axis=1).all()
     return {
         **_scene(env, drawing, {name: value.shape[-1] for name, value in frames.items()}),

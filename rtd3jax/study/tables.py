@@ -1,0 +1,158 @@
+"""The tables of a study, from the files of its lanes."""
+
+import contextlib
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+import pandas as pd
+
+from rtd3jax.errors import UserError
+from rtd3jax.study.lane_files import LaneFiles
+from rtd3jax.study.plan import Cell
+from rtd3jax.study.results import CELL, CURVES, EPISODES, METRICS, frame, read_table
+from rtd3jax.study.rundir import RunDirectory
+from rtd3jax.system.files import read_arrays
+
+SCHEMAS = {"curves": CURVES, "episodes": EPISODES, "metrics": METRICS}
+"""The tables of a run directory; ``curves.parquet`` has the schema CURVES."""
+
+_CURVE_ARRAYS = ("steps", "returns", "true_returns")
+_FINAL_ARRAYS = ("final_returns", "final_true_returns")
+
+
+@dataclasses.dataclass(frozen=True)
+class Rows:
+    """Rows of the tables, and a row for each lane that was lost or could not be trained."""
+
+    curves: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+    episodes: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+    metrics: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+    failures: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+
+    def add(self, lanes: LaneFiles, cell: Cell, seed: int) -> None:
+        """Add the rows of a lane; there are none if it has not ended.
+
+        Raises:
+            UserError: when the file of the lane is damaged.
+        """
+        row = {**cell.key, "seed": seed}
+        if not lanes.is_done(cell, seed):
+            if (reason := lanes.error(cell, seed)) is not None:
+                self.failures.append({**row, "step": "?", "reason": f"failed: {reason}"})
+            return
+        path = lanes.lane_path(cell, seed)
+        try:
+            arrays, metadata = read_arrays(path)
+            failure = metadata["failure"]
+            points = zip(*(arrays[f"results.{n}"] for n in _CURVE_ARRAYS), strict=True)
+            finals = zip(*(arrays[f"results.{n}"] for n in _FINAL_ARRAYS), strict=True)
+            curves = [
+                {**row, "step": int(step), "return": value, "true_return": true}
+                for step, value, true in points
+            ]
+            episodes = [
+                {**row, "episode": episode, "return": value, "true_return": true}
+                for episode, (value, true) in enumerate(finals)
+            ]
+            metrics = [
+                {**row, "step": int(step), "metric": name.removeprefix("metrics."), "value": value}
+                for name in sorted(arrays)
+                if name.startswith("metrics.")
+                for step, value in zip(arrays["results.steps"], arrays[name], strict=True)
+            ]
+        except (UserError, KeyError, ValueError, TypeError) as error:
+            raise UserError(
+                f"{error}: remove {path} and repeat the command to train this lane again"
+            ) from error
+        self.curves.extend(curves)
+        self.episodes.extend(episodes)
+        self.metrics.extend(metrics)
+        if failure is not None:
+            self.failures.append({**row, **failure})
+
+
+def rows_of_lanes(directory: RunDirectory) -> Rows:
+    """The rows of all lanes that have ended.
+
+    Raises:
+        UserError: when the file of a lane is damaged.
+    """
+    rows = Rows()
+    for cell in directory.cells:
+        for seed in directory.seeds:
+            rows.add(directory.lanes, cell, seed)
+    return rows
+
+
+def current_tables(
+    directory: RunDirectory, notes: list[str] | None = None
+) -> dict[str, pd.DataFrame]:
+    """The tables `SCHEMAS` of all lanes that have ended; without any lane they are empty.
+
+    They are those of the Parquet files, with the lanes that ended after these were written: a
+    sweep that is killed does not write its tables any more. Nothing is written.
+
+    Args:
+        directory: the run directory.
+        notes: gets a line for each file that cannot be read, which is then left out.
+
+    Raises:
+        UserError: when the file of a table or of a later lane is damaged, without ``notes``.
+    """
+    tables = {}
+    for name, schema in SCHEMAS.items():
+        tables[name] = frame([], schema)
+        path = directory.path / f"{name}.parquet"
+        with _noted(notes):
+            if path.exists():
+                tables[name] = read_table(path, schema)
+    rows, replaced = Rows(), _later_lanes(directory, tables)
+    for cell, seed in replaced:
+        with _noted(notes):
+            rows.add(directory.lanes, cell, seed)
+    if not replaced:
+        return tables
+    lanes = [(*cell.key.values(), seed) for cell, seed in replaced]
+    found = {}
+    for name, table in tables.items():
+        stays = ~pd.MultiIndex.from_frame(table[[*CELL, "seed"]]).isin(lanes)
+        new = frame(vars(rows)[name], SCHEMAS[name])
+        found[name] = pd.concat([table[stays], new], ignore_index=True)
+    return found
+
+
+def _later_lanes(
+    directory: RunDirectory, tables: dict[str, pd.DataFrame]
+) -> list[tuple[Cell, int]]:
+    """The lanes with files that are not in the tables, or that are newer than these.
+
+    A file is newer if the lane was trained further, or again.
+    """
+    table = directory.path / "curves.parquet"
+    written = table.stat().st_mtime_ns if table.exists() else 0
+    there = {
+        lane
+        for name in ("curves", "episodes")
+        for lane in tables[name][[*CELL, "seed"]].itertuples(index=False, name=None)
+    }
+    found = []
+    for cell in directory.cells:
+        for seed in directory.seeds:
+            path = directory.lanes.lane_path(cell, seed)
+            if path.exists() and (
+                (*cell.key.values(), seed) not in there or path.stat().st_mtime_ns >= written
+            ):
+                found.append((cell, seed))
+    return found
+
+
+@contextlib.contextmanager
+def _noted(notes: list[str] | None) -> Iterator[None]:
+    """Turn a UserError into a line of ``notes``, if there are notes."""
+    try:
+        yield
+    except UserError as error:
+        if notes is None:
+            raise
+        notes.append(str(error))

@@ -1,0 +1,110 @@
+"""Tests that tables hold all lanes that have ended, also after a sweep was killed."""
+
+import os
+import shutil
+
+import pandas as pd
+import pytest
+from made_run import make_run
+
+import rtd3jax as rtd
+from rtd3jax.study.comparison import compare_runs
+from rtd3jax.study.derive import derive
+from rtd3jax.study.plan import Grid
+from rtd3jax.study.report.page import page_data
+from rtd3jax.study.results import key_columns
+from rtd3jax.study.rundir import RunDirectory
+from rtd3jax.study.tables import SCHEMAS, current_tables
+from rtd3jax.system.files import read_arrays, write_arrays
+
+
+@pytest.fixture
+def whole(tmp_path):
+    """A run whose tables hold all of its lanes: two cells of two seeds."""
+    return make_run(tmp_path / "whole", Grid("rover", ("ar1-slip",), ("td3", "h-td3"), (2,)))
+
+
+def killed_after(whole, count, path):
+    """The run as it was left if the sweep was killed after its tables had ``count`` lanes."""
+    shutil.copytree(whole.path, path)
+    directory = RunDirectory.open(path)
+    files = sorted(path.glob("lanes/*/*.safetensors"))
+    later = {file: file.read_bytes() for file in files[count:]}
+    for file in later:
+        file.unlink()
+    for name in SCHEMAS:
+        (path / f"{name}.parquet").unlink()
+    if count:
+        derive(directory, [], pictures=False)
+    for file, content in later.items():
+        file.write_bytes(content)
+    return directory
+
+
+def same(tables, expected):
+    """Whether the rows of trained lanes are the same in any order."""
+    for name, schema in SCHEMAS.items():
+        keys = key_columns(schema)
+        one, other = (
+            table[name].loc[table[name]["seed"] >= 0].sort_values(keys).reset_index(drop=True)
+            for table in (tables, expected)
+        )
+        pd.testing.assert_frame_equal(one, other)
+    return True
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_lanes_that_ended_after_the_tables_were_written_are_there(count, whole, tmp_path):
+    expected = current_tables(whole)
+    assert expected["episodes"]["seed"].nunique() == 3  # two seeds, and the reference's
+    killed = killed_after(whole, count, tmp_path / "killed")
+    assert same(current_tables(killed), expected)
+    study = rtd.Study(killed.cells, seeds=killed.seeds, out=killed.path, final_episodes=2)
+    assert same(study.tables(), expected)
+    data = page_data(killed, complete=False, playback=False)
+    assert data["notes"] == [] and [cell["final"]["return"]["n"] for cell in data["cells"]] == [
+        2,
+        2,
+    ]
+    compared = compare_runs([whole, killed], ["whole", "killed"])
+    assert compared["n"].tolist() == [2] * 4 and compared["pairs"].tolist() == [0, 2] * 2
+
+
+def test_a_lane_that_was_trained_again_replaces_its_rows(whole):
+    before = current_tables(whole)
+    path = whole.lanes.lane_path(whole.cells[0], 1)
+    arrays, metadata = read_arrays(path)
+    arrays["results.final_returns"] = arrays["results.final_returns"] + 1.0
+    write_arrays(path, arrays, metadata)
+    after = current_tables(whole)
+    assert len(after["episodes"]) == len(before["episodes"])
+    changed = after["episodes"]["return"].sum() - before["episodes"]["return"].sum()
+    assert changed == pytest.approx(2.0, abs=1e-5)  # two episodes
+
+
+def test_tables_without_the_files_of_lanes_stay(whole, tmp_path):
+    """A copy may have the tables only."""
+    copy = tmp_path / "copy"
+    shutil.copytree(whole.path, copy, ignore=shutil.ignore_patterns("lanes"))
+    assert same(current_tables(RunDirectory.open(copy)), current_tables(whole))
+
+
+def test_a_damaged_lane_or_table_is_named(whole):
+    expected = current_tables(whole)
+    damaged = whole.lanes.lane_path(whole.cells[1], 0)
+    content = damaged.read_bytes()
+    damaged.write_bytes(content[:-1])
+    with pytest.raises(rtd.UserError, match=f"remove .*{damaged.name} and repeat the command"):
+        current_tables(whole)
+    notes = []
+    assert len(current_tables(whole, notes)["curves"]) == len(expected["curves"]) * 3 // 4
+    assert len(notes) == 1 and damaged.name in notes[0]
+
+    damaged.write_bytes(content)
+    (whole.path / "episodes.parquet").write_bytes(b"nothing")
+    os.utime(whole.path / "curves.parquet")
+    with pytest.raises(rtd.UserError, match="not a readable Parquet file"):
+        current_tables(whole)
+    notes = []
+    assert len(current_tables(whole, notes)["curves"]) == len(expected["curves"])
+    assert len(notes) == 1
