@@ -78,7 +78,9 @@ def _read_table(path: str | os.PathLike) -> "pd.DataFrame":
     try:
         if file.is_file() and file.stat().st_size == 0:
             raise UserError(f"{path} is empty: it needs a line of column names and rows of numbers")
-        table = read(file)
+        # By a handle, because PyArrow does not take a path whose bytes are not text.
+        with file.open("rb") as handle:
+            table = read(handle)
         if read is pd.read_csv and not isinstance(table.index, pd.RangeIndex):
             raise UserError(
                 f"{path} has rows with more cells than its line of column names (a comma at the "

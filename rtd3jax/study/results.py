@@ -111,8 +111,9 @@ def read_table(path: str | os.PathLike, schema: pa.Schema | None = None) -> pd.D
     if not path.is_file():
         raise UserError(f"no results table at {path}")
     try:
-        with pq.ParquetFile(path, page_checksum_verification=True) as file:
-            table = file.read()
+        # By a handle, because PyArrow does not take a path whose bytes are not text.
+        with path.open("rb") as handle:
+            table = pq.ParquetFile(handle, page_checksum_verification=True).read()
     except (pa.ArrowException, OSError) as error:
         raise UserError(f"{path} is not a readable Parquet file: {error}") from error
     expected = [CURVES, EPISODES, METRICS] if schema is None else [schema]

@@ -2,16 +2,18 @@
 
 import os
 import shutil
+import sys
 
 import pandas as pd
 import pytest
 from made_run import make_run
 
 import rtd3jax as rtd
+from rtd3jax import stress
 from rtd3jax.study.comparison import compare_runs
 from rtd3jax.study.derive import derive
 from rtd3jax.study.plan import Grid
-from rtd3jax.study.report.page import page_data
+from rtd3jax.study.report.page import page_data, write_page
 from rtd3jax.study.results import key_columns
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.tables import SCHEMAS, current_tables
@@ -108,3 +110,15 @@ def test_a_damaged_lane_or_table_is_named(whole):
     notes = []
     assert len(current_tables(whole, notes)["curves"]) == len(expected["curves"])
     assert len(notes) == 1
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names are bytes only on Linux")
+def test_the_name_of_a_run_may_be_bytes_that_are_not_text(tmp_path):
+    run = make_run(
+        tmp_path / os.fsdecode(b"run-\xff"), Grid("rover", ("ar1-slip",), ("td3",), (1,))
+    )
+    assert len(current_tables(run)["curves"]) == 6
+    page = write_page(run, playback=False, complete=False)
+    assert "<title>run-?" in page.read_text("utf-8")
+    assert stress.main([str(run.path), "--episodes", "1", "--stresses", "noise=0"]) == 0
+    assert page_data(run, complete=False, playback=False)["robustness"]

@@ -122,7 +122,9 @@ def render(data: dict[str, Any]) -> str:
     document = (parts / "page.html").read_text("utf-8")
     # The template is split first, so that marks in a run's own text are never replaced.
     found = document.split("@@")
-    return "".join(pieces[part] if index % 2 else part for index, part in enumerate(found))
+    page = "".join(pieces[part] if index % 2 else part for index, part in enumerate(found))
+    # The name of the run may contain bytes that are not text.
+    return page.encode("utf-8", "replace").decode()
 
 
 def _json_in_html(data: object) -> str:
@@ -130,8 +132,7 @@ def _json_in_html(data: object) -> str:
     text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     for character in "<>&\u2028\u2029":
         text = text.replace(character, f"\\u{ord(character):04x}")
-    # A file name may contain bytes that are not text.
-    return text.encode("utf-8", "replace").decode()
+    return text
 
 
 def _check_ours(path: Path) -> None:

@@ -62,7 +62,9 @@ def read_table(path: Path, columns: Sequence[str]) -> pd.DataFrame | None:
     if not path.is_file():
         return None
     try:
-        table = pd.read_parquet(path)
+        # By a handle, because PyArrow does not take a path whose bytes are not text.
+        with path.open("rb") as file:
+            table = pd.read_parquet(file)
     except (OSError, ValueError) as error:
         raise UserError(f"{path.name} cannot be read ({str(error).splitlines()[0]})") from error
     missing = [name for name in columns if name not in table.columns]
