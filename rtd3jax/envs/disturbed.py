@@ -128,18 +128,14 @@ class Disturbed(ValueIdentity, environment.Environment):
             )
         return size
 
-    def undisturbed_reset(self, key: jax.Array, params: DisturbedParams) -> tuple[jax.Array, Any]:
-        """The undisturbed first observation [S] and the state, for the same key as `reset_env`."""
-        key_env, _, _ = jax.random.split(key, 3)
-        with foreign_code():
-            observation, state = self.base.reset_env(key_env, params.env)
-        return jnp.asarray(observation, jnp.float32), state
-
     def reset_env(
         self, key: jax.Array, params: DisturbedParams
     ) -> tuple[jax.Array, DisturbedState]:
         """Start an episode and all processes; returns the first observation [O] and the state."""
-        return self._begin_episode(key, *self.undisturbed_reset(key, params), params)
+        key_env, _, _ = jax.random.split(key, 3)
+        with foreign_code():
+            first, env = self.base.reset_env(key_env, params.env)
+        return self._begin_episode(key, jnp.asarray(first, jnp.float32), env, params)
 
     def reset_where(
         self, where: jax.Array, key: jax.Array, state: DisturbedState, params: DisturbedParams

@@ -200,7 +200,12 @@ def register(
     description = dataclasses.replace(description, stresses=(*description.stresses, *factors))
     extras = (*extras[:3], description)
     known = next(
-        (e.description for e in _entries.values() if e.env is not None and e.env == env), None
+        (
+            other.description
+            for name, other in _entries.items()
+            if name != env_id and other.env is not None and other.env == env
+        ),
+        None,
     )
     if known is not None:
         extras = (*extras[:3], description.or_else(known))

@@ -41,7 +41,7 @@ class Trajectory:
     Attributes:
         seen: float32 [E, T + 1, O], the observations of the policy.
         true: float32 [E, T + 1, S], the undisturbed observations; NaN in row 0 if the environment
-            does not provide it.
+            has them in ``info`` but no method ``true_observation``.
         actions: float32 [E, T, A], flat, in the environment's units.
         rewards: float32 [E, T], the rewards of the environment.
         true_rewards: float32 [E, T], rewards of the undisturbed state, if the environment provides
@@ -199,6 +199,9 @@ def _play(policy, env, params, key, episodes, steps, hidden, types):
     reset_keys = jax.random.split(reset_key, episodes)
     with foreign_code():
         observation, state = jax.vmap(env.reset, in_axes=(0, None))(reset_keys, params)
+        true = None
+        if hasattr(env, "true_observation"):
+            true = jax.vmap(env.true_observation, in_axes=(0, None))(state, params)
     memory = jax.vmap(policy.init)(jax.random.split(policy_key, episodes))
     first = observation.astype(jnp.float32)
 
@@ -236,11 +239,9 @@ def _play(policy, env, params, key, episodes, steps, hidden, types):
     frames["seen"] = jnp.concatenate([first[:, None], frames["seen"]], axis=1)
     if "true" not in frames:
         return {**frames, "true": frames["seen"]}
-    if isinstance(env, Disturbed):
-        true, _ = jax.vmap(env.undisturbed_reset, in_axes=(0, None))(reset_keys, params)
-    else:  # the undisturbed first observation of such an environment is not known
-        true = jnp.full((episodes, frames["true"].shape[-1]), jnp.nan, jnp.float32)
-    frames["true"] = jnp.concatenate([true[:, None], frames["true"]], axis=1)
+    if true is None:
+        true = jnp.full((episodes, frames["true"].shape[-1]), jnp.nan)
+    frames["true"] = jnp.concatenate([true.astype(jnp.float32)[:, None], frames["true"]], axis=1)
     return frames
 
 

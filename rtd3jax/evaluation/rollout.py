@@ -69,7 +69,8 @@ def check_counts(episodes: int, seed: int, name_of_episodes: str = "episodes") -
     """Raise UserError for an impossible number of episodes or an impossible seed."""
     for name, value, low in ((name_of_episodes, episodes, 1), ("seed", seed, 0)):
         if not is_whole(value) or not low <= value < 2**32:
-            raise UserError(f"{name} must be an integer of at least {low}, not {value!r}")
+            high = " and less than 2**32" if is_whole(value) and value >= low else ""
+            raise UserError(f"{name} must be an integer of at least {low}{high}, not {value!r}")
 
 
 def unchecked_returns(

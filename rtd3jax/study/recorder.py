@@ -43,6 +43,7 @@ class Recorder:
         self._interim = interim
         self._logger = logger
         self._logged: dict[int, int] = {}
+        self._failed: set[int] = set()
         self._there = repair_log(directory.path / LOG)
         self._began = time.perf_counter() if began is None else began
         self._complaints = complaints
@@ -51,6 +52,9 @@ class Recorder:
     def update(self, group: Group) -> None:
         """Record a chunk of ``group``, its end, or its error."""
         if group.error is not None:
+            if id(group) in self._failed:  # an earlier event was handled after the error
+                return
+            self._failed.add(id(group))
             reason = short_reason(group.error)
             for job in group.jobs:
                 cell, seed = job.key
@@ -63,7 +67,7 @@ class Recorder:
             for job, state in group.lanes():
                 stays = self._keep_checkpoints and int(state.failure) == HEALTHY
                 if stays:  # first, so that no lane has a file but no checkpoint
-                    self._checkpoints.save([(job, state)], group, group.step, kept=1)
+                    self._checkpoints.save_lane(job, state, group.step, kept=1)
                 self._keep(job, state)
                 if not stays:
                     self._checkpoints.discard(job)

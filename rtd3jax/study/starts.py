@@ -7,7 +7,7 @@ from rtd3jax.errors import UserError
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.system.files import user_path
-from rtd3jax.training.checkpoint import checkpoint_files
+from rtd3jax.training.checkpoint import checkpoint_files, checkpoint_steps
 from rtd3jax.training.lanes import Job
 from rtd3jax.training.start import Start, starts_of_path
 
@@ -121,6 +121,8 @@ def _start(directory: RunDirectory, cell: Cell, seed: int, disturbance: str) -> 
         raise UserError(f"{path} has no seed {seed} to begin from; its seeds are {directory.seeds}")
     where = f"{path} {other.env} {other.disturbance}"
     kept = checkpoint_files(directory.lanes.checkpoint_directory(other, seed))
-    if kept and directory.lanes.is_done(other, seed):
+    steps = checkpoint_steps(directory.lanes.checkpoint_directory(other, seed))
+    # A sweep that was killed may leave a checkpoint of an earlier step beside the trained policy.
+    if directory.lanes.is_done(other, seed) and steps and steps[0] >= other.config.total_steps:
         return Start(where, checkpoint=kept[0])
     return Start(where, policy=directory.lanes.policy(other, seed))

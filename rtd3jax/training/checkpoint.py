@@ -70,30 +70,35 @@ class Checkpoints:
         self._identity_of = identity_of
         self._seconds = seconds
         self._steps = steps
-        self._written: dict[int, tuple[float, int]] = {}
+        self._written: dict[int, int] = {}
+        self._tried: dict[int, tuple[float, int]] = {}
         self._cost: dict[int, float] = {}
 
     def is_due(self, group: Any) -> bool:
         """Whether the group needs a new checkpoint."""
         now = time.monotonic()
-        when, step = self._written.setdefault(id(group), (now, 0))
+        when, step = self._tried.setdefault(id(group), (now, 0))
         seconds = self._seconds
         if seconds is None:
             seconds = max(DEFAULT_SECONDS, _PATIENCE * self._cost.get(id(group), 0.0))
         by_time = now - when >= seconds
         return by_time or (self._steps is not None and group.step - step >= self._steps)
 
-    def save(
-        self, jobs: Iterable[tuple[Any, LaneState]], group: Any, step: int, kept: int = KEPT
-    ) -> None:
-        """Write a checkpoint of each lane at ``step``; then remove all but the last ``kept``."""
+    def save(self, group: Any) -> None:
+        """Write a checkpoint of each lane of ``group``.
+
+        Raises:
+            UserError: when a checkpoint cannot be written; the others are written.
+        """
         began = time.monotonic()
-        # A lane that cannot be written does not stop the others.
-        _each(lambda lane: self._write(lane[0], lane[1], step, kept), jobs)
-        self.note(group, step)
+        # After an error, too, the next attempt is after the usual time.
+        self._tried[id(group)] = (began, group.step)
+        _each(lambda lane: self.save_lane(lane[0], lane[1], group.step), group.lanes())
+        self.note(group, group.step)
         self._cost[id(group)] = time.monotonic() - began
 
-    def _write(self, job: Any, state: LaneState, step: int, kept: int) -> None:
+    def save_lane(self, job: Any, state: LaneState, step: int, kept: int = KEPT) -> None:
+        """Write a checkpoint of a lane at ``step``; then remove all but the last ``kept``."""
         directory = self._directory_of(job)
         metadata = {
             "format": _FORMAT,
@@ -128,12 +133,13 @@ class Checkpoints:
 
     def note(self, group: Any, step: int) -> None:
         """Note that each lane of ``group`` has a checkpoint at ``step``."""
-        self._written[id(group)] = (time.monotonic(), step)
+        self._written[id(group)] = step
+        self._tried[id(group)] = (time.monotonic(), step)
 
     def save_once(self, group: Any) -> None:
         """Write a checkpoint of each lane of ``group``, unless its last one is at this step."""
-        if self._written.get(id(group), (0.0, None))[1] != group.step:
-            self.save(group.lanes(), group, group.step)
+        if self._written.get(id(group)) != group.step:
+            self.save(group)
 
     def save_all(self, groups: Iterable[Any]) -> None:
         """`save_once` for each group; an error is raised after all others are written."""

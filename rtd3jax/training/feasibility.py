@@ -25,9 +25,11 @@ def why_untrained(config: Config) -> str | None:
     critics, actor = updates_of(config)
     end = "the actor will not change"
     if critics == 0:
+        starts = config.first_learning_step * config.environments
+        rounded = f", which becomes {starts:,}" if starts != config.learning_starts else ""
         return (
             f"total_steps ({config.total_steps:,}) is not more than learning_starts "
-            f"({config.learning_starts:,}), so there will be no update and {end}: "
+            f"({config.learning_starts:,}{rounded}), so there will be no update and {end}: "
             "raise total_steps or lower learning_starts"
         )
     if actor == 0 and "actor" not in config.frozen:

@@ -23,6 +23,7 @@ import numpy as np
 
 from rtd3jax.envs.compat.simulated import fleet_of
 from rtd3jax.envs.compat.simulator_state import simulator_handles
+from rtd3jax.errors import UserError
 from rtd3jax.system.interrupts import patient
 from rtd3jax.system.machine import cores
 from rtd3jax.system.program_cache import make_room, on_full
@@ -73,6 +74,7 @@ class Group:
         wave: groups of a wave begin before groups of the next wave.
         state: state of all lanes, with a leading axis if there are several; None before the start.
         step: number of steps so far.
+        began_at: number of steps of the checkpoint from which it continues.
         returns: learning curves so far, [lanes, K], on the host: a device may be using ``state``.
         metrics: metrics of learning so far, [lanes, K, M], on the host.
         simulators: handles of the lanes' simulators on the host; empty without simulators.
@@ -84,6 +86,7 @@ class Group:
     wave: int = 0
     state: LaneState | None = None
     step: int = 0
+    began_at: int = 0
     returns: np.ndarray | None = None
     metrics: np.ndarray | None = None
     simulators: list[int] = dataclasses.field(default_factory=list)
@@ -133,7 +136,10 @@ def workers() -> list[Any]:
 
 def _default_device() -> Any:
     """JAX's default device, which `jax_default_device` can set."""
-    return jax.config.values["jax_default_device"] or jax.local_devices()[0]
+    device = jax.config.values["jax_default_device"]
+    if isinstance(device, str):  # the name of a platform
+        return jax.local_devices(backend=device)[0]
+    return device or jax.local_devices()[0]
 
 
 def make_groups(
@@ -328,10 +334,18 @@ def _train(pool: _Pool, device: jax.Device, checkpoints: Checkpoints | None) -> 
             if not group.finished:
                 _chunk(group, device, rates)
             if checkpoints is not None and not group.finished and checkpoints.is_due(group):
-                checkpoints.save(group.lanes(), group, group.step)
+                _save(group, checkpoints)
         except BaseException as error:  # the group keeps the error; the others continue
             group.error = error
         pool.give_back(group)
+
+
+def _save(group: Group, checkpoints: Checkpoints) -> None:
+    """Write checkpoints of the group; a full disk does not end the training."""
+    try:
+        checkpoints.save(group)
+    except UserError as error:
+        warnings.warn(f"{error}; the training continues, and tries again later", stacklevel=2)
 
 
 def _restore(group: Group, checkpoints: Checkpoints) -> None:
@@ -344,6 +358,7 @@ def _restore(group: Group, checkpoints: Checkpoints) -> None:
         ]
         single = len(states) == 1
         state = states[0] if single else jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+        group.began_at = step
         _advanced(group, state, step)
         checkpoints.note(group, step)
 

@@ -258,7 +258,8 @@ class Program:
             # Always false: a loss is never negative, and an action never exceeds one.
             never=(loss < 0.0) & jnp.all(action > 1.0),
         )
-        finite = jnp.all(jnp.isfinite(final_observation)) & jnp.all(jnp.isfinite(reward))
+        told = state.observation, final_observation, reward, truth
+        finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(told)]))
         state = dataclasses.replace(
             state,
             learner=learner,

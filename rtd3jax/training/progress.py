@@ -32,7 +32,7 @@ class Progress:
         self._groups = groups
         self._label = label
         self._began = time.perf_counter()
-        self._start = self._done()
+        self._start = 0
         self._latest: dict[tuple[str, int], float] = {}
         self._bar = Bar(
             TextColumn("{task.percentage:3.0f}%"),
@@ -64,6 +64,11 @@ class Progress:
             curve = curve[np.isfinite(curve)]
             if curve.size:
                 self._latest[self._label(job), id(job)] = float(curve[-1])
+        # Workers read checkpoints when they begin. Their steps take no time, so they are set and
+        # not added, which would count for the speed.
+        start = sum(group.began_at * len(group.jobs) for group in self._groups)
+        self._bar.tasks[self._task].completed += start - self._start
+        self._start = start
         done = self._done()
         elapsed = time.perf_counter() - self._began
         if self._remark and elapsed > LONG_SECONDS and done < self._total:

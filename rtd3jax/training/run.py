@@ -45,7 +45,7 @@ from rtd3jax.training.start import Start, starts_of_path
 
 _REASONS = {
     ENVIRONMENT_NOT_FINITE: "the environment returned an observation or reward that is not finite; "
-    "check its step function",
+    "check its reset and step functions",
     LOSS_NOT_FINITE: "the critics' loss is not finite; lower actor_learning_rate and "
     "critic_learning_rate",
 }

@@ -297,6 +297,19 @@ def test_a_cell_that_runs_again_registers_again(monkeypatch):
         run("notebook", base)
 
 
+def test_a_new_registration_keeps_nothing_of_the_one_that_it_replaces(monkeypatch):
+    monkeypatch.setattr(registry, "_entries", dict(registry._entries))
+    base = make("PointRobot-misc")
+    wrong = {"stand": lambda env: [0.0, 0.0]}
+    register("robot", base, baselines=wrong, ceiling=lambda env, episodes, seed: 0.0)
+    register("alias", base)  # another name of it has what is known
+    assert registry.description_of(base, "alias").baselines == wrong
+    del registry._entries["alias"]
+    register("robot", base)
+    found = registry.description_of(base, "robot")
+    assert found.baselines == {} and found.ceiling is None
+
+
 def test_nearest_says_nothing_without_a_likeness():
     assert nearest("sigm", ["sigma"]) == "; did you mean 'sigma'?"
     assert nearest("xyz", ["sigma"]) == ""

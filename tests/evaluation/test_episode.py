@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnax.environments import environment, spaces
+from gymnax.environments.classic_control.pendulum import Pendulum
 
 import rtd3jax as rtd
 
@@ -192,3 +193,35 @@ def test_a_flat_constant_action_gets_the_environments_shape():
         assert float(rtd.evaluate(policy, env, 1)[0]) == 2 * (0 + 1 + 2)
         assert float(rtd.rollout(policy, env).returns[0]) == 2 * (0 + 1 + 2)
         assert rtd.robustness(policy, env, ["delay=0"], 1)["return"].item() == 2 * (0 + 1 + 2)
+
+
+class Telling(Pendulum):
+    """Reads its angle with an offset, and tells the undisturbed observation."""
+
+    def reset_env(self, key, params):
+        observation, state = super().reset_env(key, params)
+        return observation + 1.0, state
+
+    def step_env(self, key, state, action, params):
+        observation, state, reward, terminated, info = super().step_env(key, state, action, params)
+        return (
+            observation + 1.0,
+            state,
+            reward,
+            terminated,
+            {**info, "true_observation": observation},
+        )
+
+
+class TellingAtOnce(Telling):
+    def true_observation(self, state, params):
+        return self.get_obs(state)
+
+
+def test_the_first_true_observation_is_known_from_the_method():
+    policy = rtd.constant_policy([0.0])
+    played = rtd.rollout(policy, TellingAtOnce(), steps=3)
+    np.testing.assert_allclose(played.true, played.seen - 1.0, atol=1e-6)
+    played = rtd.rollout(policy, Telling(), steps=3)
+    assert np.isnan(played.true[:, 0]).all()
+    np.testing.assert_allclose(played.true[:, 1:], played.seen[:, 1:] - 1.0, atol=1e-6)

@@ -1,6 +1,7 @@
 """Tests bit-identical continuation from checkpoints, and messages about bad checkpoints."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -194,7 +195,7 @@ def test_static_options_of_an_environment_identify_a_lane(first, second, differe
         return checkpoints, job, job.program.init(job.lane)
 
     checkpoints, job, state = write(first)
-    checkpoints.save([(job, state)], object(), 10)
+    checkpoints.save_lane(job, state, 10)
     assert checkpoints.restore([job]) is not None
     checkpoints, job, _ = write(second)
     with pytest.raises(rtd.UserError, match=f"another identity .plant: .*{difference}"):
@@ -238,11 +239,46 @@ def test_a_lane_that_cannot_be_written_does_not_stop_the_others(tmp_path, monkey
         assert "seed-1" in saved
 
 
+@pytest.mark.parametrize("strategy", ["map", "vmap"])
+def test_a_disk_that_is_full_for_a_moment_does_not_end_the_training(
+    strategy, tmp_path, whole, monkeypatch
+):
+    failures = []
+
+    def fail_twice(file, *rest):
+        if len(failures) < 2:
+            failures.append(file)
+            raise OSError(28, "No space left on device")
+        write_arrays(file, *rest)
+
+    monkeypatch.setattr(checkpoint, "write_arrays", fail_twice)
+    monkeypatch.setattr(lanes, "_FIRST_CHUNK", 13)
+    monkeypatch.setattr(lanes, "CHUNK_SECONDS", 0.0)
+    with pytest.warns(UserWarning, match="No space left on device; the training continues"):
+        result = _train(tmp_path, checkpoint_seconds=0.0, strategy=strategy)
+    assert len(failures) == 2
+    assert np.isfinite(result.returns).all()
+    if strategy == "map":
+        _assert_same(result, whole)
+    for seed in SEEDS:  # those of the end could be written
+        assert checkpoint_steps(tmp_path / f"seed-{seed}")[0] == CONFIG.total_steps
+
+
+def test_a_checkpoint_of_one_lane_is_not_one_of_its_group(tmp_path):
+    """Else an interrupt after it would lose the last steps of the other lanes."""
+    checkpoints = Checkpoints(lambda job: tmp_path / job, lambda job: {})
+    state = {"leaf": np.zeros(1)}
+    group = SimpleNamespace(step=7, lanes=lambda: [("a", state), ("b", state)])
+    checkpoints.save_lane("a", state, 7, kept=1)
+    checkpoints.save_once(group)
+    assert checkpoint_steps(tmp_path / "a") == checkpoint_steps(tmp_path / "b") == [7]
+
+
 def test_files_of_later_steps_do_not_outlive_a_lane_that_started_over(tmp_path):
     """Its new checkpoints would be the oldest, and be removed as soon as they are written."""
     checkpoints = Checkpoints(lambda job: tmp_path, lambda job: {})
     for step in (1_637, 2_000, 600, 700, 800):
-        checkpoints.save([(None, {"leaf": np.zeros(1)})], step, step)
+        checkpoints.save_lane(None, {"leaf": np.zeros(1)}, step)
         newest = checkpoint_steps(tmp_path)
         assert newest[0] == step and len(newest) <= 2
     assert newest == [800, 700]
@@ -278,7 +314,7 @@ def test_typed_keys_survive(tmp_path):
 def test_large_checkpoints_wait_longer_by_default(tmp_path, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(checkpoint.time, "monotonic", lambda: now[0])
-    group = type("Group", (), {"step": 0})()
+    group = SimpleNamespace(step=1, lanes=lambda: [(None, {"leaf": np.zeros(1)})])
 
     def slow_write(*_):
         now[0] += 6.0
@@ -287,7 +323,7 @@ def test_large_checkpoints_wait_longer_by_default(tmp_path, monkeypatch):
     for seconds, wait in ((None, 900.0), (60.0, 60.0)):
         checkpoints = checkpoint.Checkpoints(lambda job: tmp_path, lambda job: {}, seconds)
         assert not checkpoints.is_due(group)
-        checkpoints.save([(None, {"leaf": np.zeros(1)})], group, 1)
+        checkpoints.save(group)
         now[0] += wait - 1.0
         assert not checkpoints.is_due(group)
         now[0] += 1.0

@@ -21,6 +21,15 @@ def config(**changes):
     [
         ({"total_steps": 20}, r"total_steps \(20\) is not more than learning_starts \(20\)"),
         ({"total_steps": 900, "learning_starts": 1_000}, "there will be no update"),
+        (
+            {
+                "total_steps": 1_008,
+                "learning_starts": 1_000,
+                "environments": 16,
+                "eval_every": 1_008,
+            },
+            r"is not more than learning_starts \(1,000, which becomes 1,008\)",
+        ),
         ({"total_steps": 21}, r"policy_delay \(2\) is more than the 1 critic updates"),
         ({"total_steps": 40, "update_every": 20}, "lower policy_delay or update_every"),
         ({"total_steps": 40, "policy_delay": 30}, "policy_delay .30. is more than the 20"),

@@ -233,9 +233,9 @@ def test_side_by_side_lanes_whose_checkpoints_are_of_no_use_begin_from_the_start
     states = jax.jit(jax.vmap(program.init))(lanes.stacked([job.lane for job in jobs], None))
     for job, group_step in zip(jobs, (20, 40), strict=True):
         (state,) = (s for j, s in lanes.Group(jobs, state=states).lanes() if j is job)
-        checkpoints.save([(job, state)], job, group_step)
+        checkpoints.save_lane(job, state, group_step)
         # The newest of both is of step 60, and the first lane's is cut short.
-        checkpoints.save([(job, state)], job, 60)
+        checkpoints.save_lane(job, state, 60)
     newest = directory.lanes.checkpoint_directory(cell, 0) / "step-000000060.safetensors"
     newest.write_bytes(newest.read_bytes()[:1000])
     add_starts(directory, jobs, write=True)
@@ -285,9 +285,13 @@ def test_a_sweep_goes_on_from_another_and_says_so(tmp_path, monkeypatch, capsys)
     before, after = rtd.load_policy(first, disturbance="ar1-slip-slow"), rtd.load_policy(second)
     assert _same(before.actor["current"], after.actor["current"])
     assert not _same(before.actor["head"], after.actor["head"])
-    # Without checkpoints there is the actor alone.
-    shutil.rmtree(tmp_path / "first" / "checkpoints")
+    # Without a checkpoint of the last step there is the actor alone. A kill between the writing of
+    # a lane's file and the removal of its checkpoints leaves those of earlier steps.
     (cell,) = RunDirectory.open(second).cells
+    for last in (tmp_path / "first" / "checkpoints").rglob("step-000000060.safetensors"):
+        last.rename(last.with_name("step-000000040.safetensors"))
+    assert starts_of(cell, [0])[0].about == f"actor of {first} rover ar1-slip-slow"
+    shutil.rmtree(tmp_path / "first" / "checkpoints")
     assert starts_of(cell, [0])[0].about == f"actor of {first} rover ar1-slip-slow"
     # What is done needs its beginning no more.
     shutil.rmtree(tmp_path / "first")

@@ -6,8 +6,10 @@ import types
 import jax
 import numpy as np
 import pytest
+from gymnax.environments.classic_control.pendulum import Pendulum
 
 import rtd3jax as rtd
+from rtd3jax.training import lanes
 from rtd3jax.training.lanes import make_groups
 from rtd3jax.training.run import make_jobs
 
@@ -193,7 +195,9 @@ def test_jax_debug_nans_does_not_end_a_training():
 def test_a_long_training_without_checkpoints_says_so_once(capsys, monkeypatch, tmp_path):
     from rtd3jax.training import progress, run
 
-    group = types.SimpleNamespace(jobs=[None], step=10, total=30, returns=np.zeros((1, 1)))
+    group = types.SimpleNamespace(
+        jobs=[None], step=10, total=30, began_at=0, returns=np.zeros((1, 1))
+    )
     for seconds, times in ((0.0, 1), (60.0, 0)):
         monkeypatch.setattr(progress, "LONG_SECONDS", seconds)
         with progress.Progress([group], str, remark=run._NO_CHECKPOINTS) as bar:
@@ -220,3 +224,37 @@ def test_side_by_side_only_lanes_of_the_same_step_advance_together():
     kept = types.SimpleNamespace(steps=lambda job: steps[job.seed])
     groups = make_groups(jobs, "vmap", 1, checkpoints=kept)
     assert [[job.seed for job in group.jobs] for group in groups] == [[0, 1], [2]]
+
+
+def test_steps_of_a_checkpoint_do_not_count_for_the_speed(monkeypatch):
+    from rtd3jax.training import progress
+
+    now = [0.0]
+    monkeypatch.setattr(progress.time, "perf_counter", lambda: now[0])
+    group = types.SimpleNamespace(
+        jobs=[None, None], step=0, total=30_000, began_at=0, returns=np.zeros((2, 1))
+    )
+    bar = progress.Progress([group], str)
+    now[0], group.began_at, group.step = 10.0, 29_000, 29_100
+    bar.update(group)
+    (task,) = bar._bar.tasks
+    assert task.fields["rate"] == "20 steps/s" and task.completed == 58_200
+    assert sum(sample.completed for sample in task._progress) == 200
+
+
+def test_an_observation_of_reset_that_is_not_finite_is_the_environments_fault():
+    class NotFiniteAtReset(Pendulum):
+        def reset_env(self, key, params):
+            observation, state = super().reset_env(key, params)
+            return observation / 0.0, state
+
+    config = dataclasses.replace(TINY, algorithm="td3", history_length=None)
+    run = rtd.train(NotFiniteAtReset(), config, [0], progress=False)
+    (failure,) = run.failures
+    assert failure.step == 0 and "the environment returned an observation" in failure.reason
+
+
+def test_the_default_device_may_be_named_by_its_platform():
+    with jax.default_device("cpu"):
+        assert lanes.default_strategy() == "map"
+        assert {device.platform for device in lanes.workers()} == {"cpu"}

@@ -386,6 +386,8 @@ def test_whoever_plays_leaves_no_simulator_busy():
     for _ in range(2):
         rtd.rollout(policy, env, episodes=3)
         assert env.fleet.count == 3 and not env.fleet._busy
+        rtd.rollout(policy, rtd.disturb(env, rtd.Dropout()), episodes=3)
+        assert env.fleet.count == 3 and not env.fleet._busy
     rtd.check_env(env)
     assert env.fleet.count == 0
     played = rtd.to_gymnasium(rtd.disturb(env, rtd.Dropout()))
