@@ -227,6 +227,9 @@ def _case(nominal: Case) -> Case:
         if isinstance(process, Process):
             return _with_process(nominal, channel, process)
         if callable(getattr(changed, "reset", None)):
+            if isinstance(env, Disturbed) and not isinstance(changed, Disturbed):
+                own = nominal.params.replace(env=parameters_of(changed))
+                changed = Disturbed(changed, env.reward_from, own)
             params = parameters_of(changed)
             interface = describe(changed, params)
             _check_sizes(interface, nominal.interface)

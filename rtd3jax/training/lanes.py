@@ -77,6 +77,7 @@ class Group:
         began_at: number of steps of the checkpoint from which it continues.
         returns: learning curves so far, [lanes, K], on the host: a device may be using ``state``.
         metrics: metrics of learning so far, [lanes, K, M], on the host.
+        device: the device that holds ``state``; None before the start.
         simulators: handles of the lanes' simulators on the host; empty without simulators.
         lost: whether every lane has failed.
         error: the exception of a group that failed.
@@ -89,6 +90,7 @@ class Group:
     began_at: int = 0
     returns: np.ndarray | None = None
     metrics: np.ndarray | None = None
+    device: Any = None
     simulators: list[int] = dataclasses.field(default_factory=list)
     lost: bool = False
     error: BaseException | None = None
@@ -152,7 +154,8 @@ def make_groups(
     """Groups of one lane (``map``), or one group per program and device (``vmap``).
 
     With ``checkpoints``, only lanes that have checkpoints at a common step form a group, so a new
-    lane does not make the others start from the beginning.
+    lane does not make the others start from the beginning. Groups that were interrupted at
+    different steps are not divided again.
 
     ``at_once`` limits the number of lanes in memory, under ``vmap`` for each device: groups are
     split, and a group waits until earlier groups have ended.
@@ -164,16 +167,13 @@ def make_groups(
     for job in jobs:
         by_program.setdefault((job.program, _structure(job.lane)), []).append(job)
     steps_of = checkpoints.steps if checkpoints is not None else lambda job: set()
-    together = [
-        part
-        for members in by_program.values()
-        for part in with_common_steps(members, list(map(steps_of, members)))
-    ]
-    shares = [
-        members[start::devices]
-        for members in together
-        for start in range(min(devices, len(members)))
-    ]
+    shares = []
+    for members in by_program.values():
+        parts = with_common_steps(members, list(map(steps_of, members)))
+        width = -(-len(members) // devices)
+        for part in parts:
+            count = devices if len(parts) == 1 else -(-len(part) // width)
+            shares += [part[start::count] for start in range(min(count, len(part)))]
     chunks = [share[k : k + most] for share in shares for k in range(0, len(share), most)]
     # Lanes that fit in memory alone need not fit together with lanes that wait.
     return [Group(chunk, wave=index // devices) for index, chunk in enumerate(chunks)]
@@ -254,7 +254,8 @@ class _Pool:
 
     def __init__(self, groups: Sequence[Group]):
         self._idle = [group for group in groups if not group.finished]
-        self._busy = 0
+        self._busy: list[Any] = []
+        """The device of each group that a worker advances."""
         cells = list(dict.fromkeys(id(group.jobs[0].cell) for group in groups))
         self._rank = {
             id(group): (group.wave, cells.index(id(group.jobs[0].cell))) for group in groups
@@ -265,24 +266,31 @@ class _Pool:
         self._stopped = False
         self._changed = threading.Condition()
 
-    def take(self) -> Group | None:
-        """The idle group with the fewest steps; None if this worker will get no more groups."""
+    def take(self, device: Any) -> Group | None:
+        """The idle group with the fewest steps; None if this worker will get no more groups.
+
+        A group whose state is on another device is only taken while that device is busy: to move
+        it takes time, and memory for a second state.
+        """
         with self._changed:
-            while (group := self._next()) is None:
+            while (group := self._next(device)) is None:
                 if self._stopped or not (self._idle or self._busy):
                     return None
                 self._changed.wait()
             self._idle.remove(group)
-            self._busy += 1
+            self._busy.append(device)
+            group.device = device
             return group
 
-    def _next(self) -> Group | None:
-        """The group to advance next; None if there is none yet."""
-        if not self._idle or self._stopped:
+    def _next(self, device: Any) -> Group | None:
+        """The group to advance next on the device; None if there is none yet."""
+        here = (None, device)
+        ready = [g for g in self._idle if g.device in here or g.device in self._busy]
+        if not ready or self._stopped:
             return None
         # One cell after the other, so that results come early and few replays are in memory;
         # within a cell, the group with the fewest steps.
-        group = min(self._idle, key=lambda g: (self._rank[id(g)], g.step))
+        group = min(ready, key=lambda g: (g.device not in here, self._rank[id(g)], g.step))
         # Recording takes a while, and the memory is enough for one wave.
         if group.state is None and any(ended.wave < group.wave for ended in self._unhandled):
             return None
@@ -290,7 +298,7 @@ class _Pool:
 
     def give_back(self, group: Group) -> None:
         with self._changed:
-            self._busy -= 1
+            self._busy.remove(group.device)
             (self._unhandled if group.finished else self._idle).append(group)
             self._events.append(group)
             self._changed.notify_all()
@@ -327,10 +335,10 @@ def _work(pool: _Pool, device: jax.Device, checkpoints: Checkpoints | None) -> N
 def _train(pool: _Pool, device: jax.Device, checkpoints: Checkpoints | None) -> None:
     """Run chunks of the group with the fewest steps, as long as there is a group."""
     rates: dict[Any, float] = {}
-    while (group := pool.take()) is not None:
+    while (group := pool.take(device)) is not None:
         try:
             if checkpoints is not None and group.state is None:
-                _restore(group, checkpoints)
+                _restore(group, checkpoints, device)
             if not group.finished:
                 _chunk(group, device, rates)
             if checkpoints is not None and not group.finished and checkpoints.is_due(group):
@@ -348,19 +356,38 @@ def _save(group: Group, checkpoints: Checkpoints) -> None:
         warnings.warn(f"{error}; the training continues, and tries again later", stacklevel=2)
 
 
-def _restore(group: Group, checkpoints: Checkpoints) -> None:
-    found = checkpoints.restore(group.jobs)
-    if found is not None:
+def _host(device: jax.Device) -> jax.Device:
+    """The device on which states are put together.
+
+    An accelerator has memory for one state of a group, but not for its parts besides.
+    """
+    try:
+        return jax.local_devices(backend="cpu")[0]
+    except RuntimeError:  # JAX_PLATFORMS excludes it
+        return device
+
+
+def _restore(group: Group, checkpoints: Checkpoints, device: jax.Device) -> None:
+    with jax.default_device(_host(device)):
+        found = checkpoints.restore(group.jobs)
+        if found is None:
+            return
         states, step = found
         states = [
             revived(job.program, job.lane, s, step)
             for job, s in zip(group.jobs, states, strict=True)
         ]
-        single = len(states) == 1
-        state = states[0] if single else jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+        state = _together(states)
         group.began_at = step
         _advanced(group, state, step)
         checkpoints.note(group, step)
+
+
+def _together(states: Sequence[LaneState]) -> LaneState:
+    """The state of a group; several lanes get a leading axis."""
+    if len(states) == 1:
+        return states[0]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
 
 
 def _advanced(group: Group, state: LaneState, step: int) -> None:
@@ -383,7 +410,7 @@ def _chunk(group: Group, device: jax.Device, rates: dict[Any, float]) -> None:
     program, width = group.jobs[0].program, len(group.jobs)
     lane = stacked([job.lane for job in group.jobs], device)
     init, advance = compiled(program, lane, width > 1, device)
-    state = _with_start(group, init(lane)) if group.state is None else group.state
+    state = _with_start(group, init(lane), device) if group.state is None else group.state
     state = jax.device_put(state, device)
     rate = rates.get((program, width))
     steps = _FIRST_CHUNK if rate is None else max(1, int(rate * CHUNK_SECONDS))
@@ -403,16 +430,19 @@ def _chunk(group: Group, device: jax.Device, rates: dict[Any, float]) -> None:
     _advanced(group, state, stop)
 
 
-def _with_start(group: Group, state: LaneState) -> LaneState:
+def _with_start(group: Group, state: LaneState, device: jax.Device) -> LaneState:
     """The group's new ``state``, in which each lane gets the networks from which it starts."""
     if all(job.start is None for job in group.jobs):
         return state
-    fresh = dataclasses.replace(group, state=state)
-    lanes = [
-        own if job.start is None else job.start.begin(job.program, job.lane, own)
-        for job, own in fresh.lanes()
-    ]
-    return lanes[0] if len(lanes) == 1 else jax.tree.map(lambda *x: jnp.stack(x), *lanes)
+    with jax.default_device(_host(device)):
+        fresh = dataclasses.replace(group, state=jax.device_put(state, _host(device)))
+        del state
+        return _together(
+            [
+                own if job.start is None else job.start.begin(job.program, job.lane, own)
+                for job, own in fresh.lanes()
+            ]
+        )
 
 
 _COPIES = 3

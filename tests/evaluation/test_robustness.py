@@ -163,6 +163,13 @@ def test_a_registration_brings_its_own_stresses(policy):
     ]
     np.testing.assert_allclose(rows["return"], expected, rtol=1e-5)
     assert rows["quantity"].tolist() == ["push in m/s"] * 2 + ["target"] * 2
+    # The own disturbance of the tested environment acts on another plant, too.
+    rows = table(policy, rover("action-delay", steps=3), [target])
+    expected = [
+        np.mean(rtd.evaluate(policy, rover("action-delay", steps=3, **plant), EPISODES, SEED))
+        for plant in ({}, {"target_speed": 0.6})
+    ]
+    np.testing.assert_allclose(rows["return"], expected, rtol=1e-5)
     with pytest.raises(rtd.UserError, match="two stresses are called 'delay'; rename"):
         rtd.register("b-rover", Rover(), stresses=[dataclasses.replace(push, name="delay")])
     with pytest.raises(rtd.UserError, match=r"stresses must be rtd\.Stress, not 'push'"):

@@ -242,8 +242,8 @@ def test_side_by_side_lanes_whose_checkpoints_are_of_no_use_begin_from_the_start
     assert not directory.lanes.start_path(cell, 0).exists()  # it stands there since they began
     (group,) = lanes.make_groups(jobs, "vmap", 1, checkpoints=checkpoints)
     with pytest.warns(UserWarning, match=f"from the beginning, with the actor of {file}"):
-        lanes._restore(group, checkpoints)
-    begun = lanes._with_start(group, states)
+        lanes._restore(group, checkpoints, jax.devices()[0])
+    begun = lanes._with_start(group, states, jax.devices()[0])
     for index in range(2):
         actor = jax.tree.map(lambda leaf, i=index: leaf[i], begun.learner.actor)
         assert _same(actor, run.policy(0).actor)
@@ -252,7 +252,7 @@ def test_side_by_side_lanes_whose_checkpoints_are_of_no_use_begin_from_the_start
     jobs = directory.jobs("vmap")
     add_starts(directory, jobs, write=True)
     with pytest.raises(rtd.UserError, match=f"began from {file} cannot start over: .* be read"):
-        lanes._with_start(lanes.Group(jobs), states)
+        lanes._with_start(lanes.Group(jobs), states, jax.devices()[0])
 
 
 FLAGS = [

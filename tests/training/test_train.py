@@ -226,6 +226,45 @@ def test_side_by_side_only_lanes_of_the_same_step_advance_together():
     assert [[job.seed for job in group.jobs] for group in groups] == [[0, 1], [2]]
 
 
+@pytest.mark.parametrize(
+    ("kept", "groups"),
+    [
+        ({}, [[0, 2, 4], [1, 3]]),
+        ({0: 40, 1: 40, 2: 40, 3: 40, 4: 40}, [[0, 2, 4], [1, 3]]),
+        # Those of two devices, which were interrupted at different steps, stay together.
+        ({0: 40, 2: 40, 4: 40, 1: 60, 3: 60}, [[0, 2, 4], [1, 3]]),
+        # What is new does not wait for a lane that began before.
+        ({3: 40}, [[3], [0, 2], [1, 4]]),
+    ],
+)
+def test_each_device_has_one_group_also_after_an_interrupt(kept, groups):
+    jobs = make_jobs(_rover(), TINY, range(5), cell="cell")
+    checkpoints = types.SimpleNamespace(
+        steps=lambda job: {kept[job.seed]} if job.seed in kept else set()
+    )
+    found = make_groups(jobs, "vmap", 2, checkpoints=checkpoints)
+    assert [[job.seed for job in group.jobs] for group in found] == groups
+    assert [group.wave for group in found] == [0, 0, 1][: len(groups)]
+
+
+def test_a_group_stays_on_its_device_unless_that_is_busy():
+    jobs = make_jobs(_rover(), TINY, range(3), cell="cell")
+    first, second, third = groups = [lanes.Group([job]) for job in jobs]
+    pool = lanes._Pool(groups)
+    assert pool.take("a") is first and pool.take("b") is second
+    first.step, second.step, third.step = 60, 40, 50
+    pool.give_back(second)
+    pool.give_back(first)
+    # Both devices return their groups before either takes again.
+    assert pool.take("a") is third and pool.take("b") is second
+    assert third.device == "a" and second.device == "b"
+    # The device of the first group is busy with the third, so another may take the first.
+    pool.give_back(second)
+    second.step = 100
+    assert pool.take("b") is second
+    assert pool.take("c") is first and first.device == "c"
+
+
 def test_steps_of_a_checkpoint_do_not_count_for_the_speed(monkeypatch):
     from rtd3jax.training import progress
 
