@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Mapping
 from typing import Any, Literal, get_args
 
-from rtd3jax.errors import UserError, check_choice, nearest
+from rtd3jax.errors import UserError, check_choice
 from rtd3jax.registries import AGENTS, MEMORIES
 
 Precision = Literal["float32", "bfloat16"]
@@ -206,11 +206,7 @@ class Config:
     def __post_init__(self) -> None:
         AGENTS.check(self.algorithm)
         MEMORIES.check(self.memory)
-        if self.precision not in PRECISIONS:
-            raise UserError(
-                f"precision {self.precision!r} is unknown{nearest(str(self.precision), PRECISIONS)}"
-                f"; choose {' or '.join(PRECISIONS)}"
-            )
+        check_choice("precision", self.precision, PRECISIONS)
         self._resolve_history_length()
         self._resolve_replay()
         for field in dataclasses.fields(self):

@@ -58,7 +58,7 @@ class Seed:
         variant = AGENTS[agent]
         self._length, self._batch, self._starts = history_length, batch, learning_starts
         self._delay, self._exploration = policy_delay, exploration_noise
-        self._keeps_carry = variant.stores_carry
+        self._keeps_carry = variant.critic_reads_carries
         self._learner = Learner(variant, OBSERVATION_SIZE, ACTION_SIZE, width)
         self._ring = Ring(
             capacity, OBSERVATION_SIZE, ACTION_SIZE, width if self._keeps_carry else None

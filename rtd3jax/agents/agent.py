@@ -95,7 +95,7 @@ class Agent:
     def stores_carry(self) -> bool:
         """Whether the replay stores the actor's carries, for the critics or for segments."""
         from_carries = self.has_running_carry and self.config.replay == "segments"
-        return self.variant.stores_carry or from_carries
+        return self.variant.critic_reads_carries or from_carries
 
     @property
     def reads_truth(self) -> bool:
@@ -138,7 +138,7 @@ class Agent:
             running: the running carry before the step; None with windows.
         """
         carry = running
-        if carry is None and self.variant.stores_carry:
+        if carry is None and self.variant.critic_reads_carries:
             carry = carry_before(self.acting, actor, window)
         kept = carry if self.stores_carry else None
         return act(self.acting, actor, window, carry), kept
@@ -196,7 +196,7 @@ class Agent:
                 *rows,
                 config.segment_steps,
                 config.burn_in_gradient,
-                critic_reads_carries=self.variant.stores_carry,
+                critic_reads_carries=self.variant.critic_reads_carries,
                 actor_goes_on=config.runs_on,
             )
         return sample(*rows)

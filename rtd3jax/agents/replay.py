@@ -2,8 +2,8 @@
 
 Every environment step writes one row, so the lane's step determines the number of the row, and the
 ring needs no counter: of K environments, environment e writes row ``s K + e`` at the lane's step s.
-If the critics of an agent start from the behaviour actor's carries (h-td3), the ring also stores
-these carries. This module ensures the order of reads and writes that this requires.
+If the critics of an agent (h-td3) or its segments start from the behaviour actor's carries, the
+ring also stores these carries. This module ensures the order of reads and writes that this needs.
 Shapes: ``C`` capacity, ``B`` batch, ``H`` width.
 """
 

@@ -45,8 +45,8 @@ class Variant:
         return bool(self.actor.memory or self.critic.memory)
 
     @property
-    def stores_carry(self) -> bool:
-        """Whether the replay stores the behaviour actor's carries."""
+    def critic_reads_carries(self) -> bool:
+        """Whether the critics start from the behaviour actor's carries, which the replay stores."""
         return self.critic.carry_from_replay
 
     @property

@@ -347,27 +347,20 @@ def from_arrays(
     arrays: dict[str, np.ndarray], program: Program, lane: Lane, file: Path
 ) -> LaneState:
     """The state from the arrays of `to_arrays`, checked against the program's state."""
-    expected = jax.eval_shape(program.init, lane)
-    leaves, structure = jax.tree_util.tree_flatten_with_path(expected)
-    names = [jax.tree_util.keystr(path) for path, _ in leaves]
-    if set(names) != set(arrays):
-        odd = sorted(set(names) ^ set(arrays))[0]
-        raise UserError(f"{file} does not fit this agent: array {odd} is missing or unexpected")
-    return jax.tree.unflatten(
-        structure,
-        [_from_array(arrays[n], leaf, n, file) for n, (_, leaf) in zip(names, leaves, strict=True)],
-    )
+    return leaves_from_arrays(jax.eval_shape(program.init, lane), arrays, "", file)
 
 
 def leaves_from_arrays(expected: Any, arrays: dict[str, np.ndarray], place: str, file: Path) -> Any:
     """A part of a state with the structure of ``expected``, from the arrays under ``place``.
+
+    With an empty ``place``, it is the whole state.
 
     Raises:
         UserError: when the arrays under ``place`` do not have this structure.
     """
     leaves, structure = jax.tree_util.tree_flatten_with_path(expected)
     named = [(place + jax.tree_util.keystr(path), leaf) for path, leaf in leaves]
-    there = {name for name in arrays if name.startswith((f"{place}.", f"{place}["))}
+    there = {name for name in arrays if not place or name.startswith((f"{place}.", f"{place}["))}
     if odd := sorted(there ^ {name for name, _ in named}):
         raise UserError(f"{file} does not fit this agent: array {odd[0]} is missing or unexpected")
     return jax.tree.unflatten(

@@ -39,7 +39,7 @@ def memory(request):
 def _ring(agent, memory="lstm"):
     """A ring that has wrapped, of random rows and carries; and the number of rows written."""
     actor = make_part(AGENTS[agent], "actor", memory, OBSERVATION, ACTION, WIDTH)
-    carry = actor.zero_carry(1) if AGENTS[agent].stores_carry else None
+    carry = actor.zero_carry(1) if AGENTS[agent].critic_reads_carries else None
     size = OBSERVATION if AGENTS[agent].reads_truth else 0
     replay, number = empty_replay(CAPACITY, OBSERVATION, ACTION, carry, 1, size), 0
     random = np.random.default_rng(0)

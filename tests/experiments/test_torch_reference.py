@@ -200,7 +200,7 @@ def test_an_update_is_the_same(batches, name):
     variant = AGENTS[name]
     batch, other_batch = batches
     other_batch = tensors(other_batch)
-    if not variant.stores_carry:
+    if not variant.critic_reads_carries:
         batch = batch.replace(carry=None, next_carry=None)
         other_batch = other_batch._replace(carry=None, next_carry=None)
     before = _learner(variant)

@@ -41,7 +41,7 @@ def _counted(algorithm, length, width, batch_size, segments=None):
     numbers = Hyperparameters(**numbers | {"history_length": jnp.int32(length)})
 
     def inputs():
-        carry = lstm.zero_carry(1, width) if variant.stores_carry else None
+        carry = lstm.zero_carry(1, width) if variant.critic_reads_carries else None
         replay = empty_replay(200, 2, 2, carry)
         if segments is None:
             rows = jnp.zeros((batch_size,), jnp.int32)

@@ -1,4 +1,4 @@
-"""TD3's targets, losses and updates (Fujimoto et al., 2018), over any of the six agents.
+"""TD3's targets, losses and updates (Fujimoto et al., 2018), over the networks of any agent.
 
 Actions are in half ranges from the centre of the environment's range, within [-1, 1], so learning
 does not depend on the units of the environment's actions; `Bounds` converts them. Shapes: ``B``
