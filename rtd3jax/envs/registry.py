@@ -177,14 +177,24 @@ def register(
         raise UserError(f"{env_id!r} must be an environment or a function, not {env!r}")
     _check_free(env_id, module, replace)
     description = Description(dict(baselines or {}), ceiling, drawing, tuple(stresses))
-    extras = (tuple(positive), tuple(reward_from_observation), with_params, description)
+    entry = _Entry(
+        None,
+        None,
+        {},
+        module,
+        tuple(positive),
+        tuple(reward_from_observation),
+        with_params,
+        description,
+    )
     if not is_environment:
-        if disturbances is not None or extras != ((), (), None, Description()):
+        if disturbances is not None or entry != _Entry(None, None, {}, module):
             raise UserError(
                 f"{env_id!r}: disturbances, baselines and other arguments are for an environment, "
                 "not for a function that makes one"
             )
-        _entries[env_id] = _Entry(None, cast("Callable[..., Any]", env), {}, module)
+        construct = cast("Callable[..., Any]", env)
+        _entries[env_id] = dataclasses.replace(entry, construct=construct)
         return
     check_gymnax(env)
     if isinstance(env, Disturbed) and acting_processes(env.default_params):
@@ -195,10 +205,10 @@ def register(
     check_composable(env)
     env = cast("EnvironmentLike", env)
     named = _named_processes(env_id, env, disturbances or {}, try_disturbances)
-    _check_extras(env_id, env, named, extras)
-    factors = _factor_stresses(env_id, own_parameters(env), positive, description.stresses)
+    entry = dataclasses.replace(entry, env=env, disturbances=named)
+    _check_extras(env_id, env, entry)
+    factors = _factor_stresses(env_id, own_parameters(env), entry.positive, description.stresses)
     description = dataclasses.replace(description, stresses=(*description.stresses, *factors))
-    extras = (*extras[:3], description)
     known = next(
         (
             other.description
@@ -208,8 +218,8 @@ def register(
         None,
     )
     if known is not None:
-        extras = (*extras[:3], description.or_else(known))
-    _entries[env_id] = _Entry(env, None, named, module, *extras)
+        description = description.or_else(known)
+    _entries[env_id] = dataclasses.replace(entry, description=description)
 
 
 def description_of(env: EnvironmentLike, env_id: str | None = None) -> Description:
@@ -245,17 +255,12 @@ def _check_free(env_id: str, module: str, replace: bool) -> None:
 _PACKAGE = __name__.partition(".")[0]
 
 
-def _check_extras(
-    env_id: str,
-    env: EnvironmentLike,
-    named: Mapping[str, tuple[str, Process]],
-    extras: tuple[tuple[str, ...], tuple[str, ...], Callable[[Any], Any] | None, Description],
-) -> None:
+def _check_extras(env_id: str, env: EnvironmentLike, entry: _Entry) -> None:
     """Raise UserError if an argument of `register` does not fit the environment."""
-    positive, reward_from_observation, with_params, description = extras
+    named, description = entry.disturbances, entry.description
     params = own_parameters(env)
     fields = list(_settable(params))
-    wanted = positive
+    wanted = entry.positive
     if description.drawing is not None:
         if not isinstance(description.drawing, Drawing):
             raise UserError(
@@ -266,12 +271,12 @@ def _check_extras(
     for name in wanted:
         if name not in fields:
             raise UserError(f"{env_id!r} has no parameter {name!r}{nearest(name, fields)}")
-    for name in reward_from_observation:
+    for name in entry.reward_from_observation:
         if name not in named:
             raise UserError(f"{env_id!r} has no disturbance {name!r}{nearest(name, named)}")
         if not hasattr(env, "observed_reward"):
             raise UserError(f"{env_id!r}: a reward from the observation needs observed_reward")
-    functions: dict[str, Any] = {"ceiling": description.ceiling, "with_params": with_params}
+    functions: dict[str, Any] = {"ceiling": description.ceiling, "with_params": entry.with_params}
     functions = {name: value for name, value in functions.items() if value is not None}
     functions |= {f"baseline {name!r}": value for name, value in description.baselines.items()}
     for name, value in functions.items():
