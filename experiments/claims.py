@@ -42,6 +42,7 @@ import rtd3jax as rtd
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from claim_tables import Results, Trainings, compare  # noqa: E402
 from effects import CONFIDENCE, ROVER_MARGIN, Effect, Equal, combine  # noqa: E402
+from pendulum_cells import HISTORIES  # noqa: E402
 from writing import RESULTS, markdown_table, provenance, write_results  # noqa: E402
 
 PARTIAL = ("temporal-sine", "random-sine", "noise", "hidden")
@@ -51,8 +52,6 @@ LSTM_AGENTS = [a for a in rtd.ALGORITHMS if a.startswith("lstm")]
 RECURRENT = [*LSTM_AGENTS, "h-td3"]
 """All agents with an LSTM layer."""
 BEST = "lstm-td3-1ha1hc"
-HISTORIES = ("lstm-td3", "lstm-td3-no-action")
-"""With and without past actions."""
 WHOLE, MIDDLE, LATE = (0.0, 1.0), (0.4, 0.6), (0.8, 1.0)
 """Parts of the training, for the clauses on its course."""
 ALIKE = 0.05

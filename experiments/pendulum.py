@@ -36,7 +36,7 @@ from rtd3jax.study.transfer import transfer
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from continuing import train_missing  # noqa: E402
-from pendulum_cells import cells, current_setting, missing, settings_of  # noqa: E402
+from pendulum_cells import cells, current_setting, in_the_paper, missing, settings_of  # noqa: E402
 from pendulum_figures import draw_all, filter_returns  # noqa: E402
 from settings import mark, notes, setting_text  # noqa: E402
 from writing import (  # noqa: E402
@@ -153,7 +153,8 @@ def table(
 ) -> str:
     """Mean normalised return ± std over seeds: rows are agents and lengths, columns disturbances.
 
-    Cells that were trained with earlier settings are marked. ``filtered`` has the returns of the
+    Cells that were trained with earlier settings are marked; those that no figure of the paper has
+    are dashes. ``filtered`` has the returns of the
     filter, for a separate row.
     """
     older = lanes["setting"] != lanes["algorithm"].map(current_setting)
@@ -166,7 +167,8 @@ def table(
                 here = own[(own["history_length"] == length) & (own[column] == name)]
                 values = here["normalised"]
                 dagger = mark(int(older[here.index].sum()), len(here))
-                line.append(f"{mean_text(values, 3)}{dagger}" if len(values) else "not run")
+                missing_text = "not run" if in_the_paper(name, algorithm) else "–"
+                line.append(f"{mean_text(values, 3)}{dagger}" if len(values) else missing_text)
             body.append(line)
     if filtered:
         known = [f"{filtered[name]:.3f}" if name in filtered else "–" for name in names]

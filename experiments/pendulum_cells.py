@@ -28,6 +28,15 @@ def current_setting(algorithm: str) -> str:
     return setting_text(settings_of(algorithm))
 
 
+HISTORIES = ("lstm-td3", "lstm-td3-no-action")
+"""The agents of the paper's figure of action history."""
+
+
+def in_the_paper(disturbance: str, algorithm: str) -> bool:
+    """Whether a figure of the paper shows the agent under the disturbance."""
+    return disturbance not in presets.ACTION_HISTORY_DISTURBANCES or algorithm in HISTORIES
+
+
 def cells(options: argparse.Namespace, tiny: dict[str, Any]) -> list[rtd.Cell]:
     """The cells of the given lengths, disturbances and agents, in the order of the lengths.
 
@@ -43,7 +52,7 @@ def cells(options: argparse.Namespace, tiny: dict[str, Any]) -> list[rtd.Cell]:
         pairs += [
             (disturbance, algorithm)
             for disturbance in presets.ACTION_HISTORY_DISTURBANCES
-            for algorithm in ("lstm-td3", "lstm-td3-no-action")
+            for algorithm in HISTORIES
             if algorithm in options.algorithms
         ]
     found: dict[tuple[object, ...], rtd.Cell] = {}

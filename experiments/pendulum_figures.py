@@ -5,7 +5,8 @@ Usage: python experiments/pendulum_figures.py [--results DIR] [--out DIR]
 The script reads pendulum.parquet, pendulum_curves.parquet and generalisation.parquet. It writes the
 following figures as PNG and SVG, if the tables have rows for them:
 
-* pendulum_learning_curves: rows are disturbances, columns are agents, a curve per length;
+* pendulum_learning_curves: rows are disturbances, columns are agents, a curve per length; a dash is
+  for agents that the paper does not show under the disturbance;
 * pendulum: final return for each agent, a line per length; dots are seeds; the dashed line is a
   Bayes filter that knows the process;
 * action_history: `lstm-td3` with and without past actions, a panel per length;
@@ -28,7 +29,7 @@ from rtd3jax.study import presets
 from rtd3jax.study.colours import colour_of
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-from pendulum_cells import current_setting  # noqa: E402
+from pendulum_cells import current_setting, in_the_paper  # noqa: E402
 from writing import RESULTS  # noqa: E402
 
 DISTURBANCES = (*presets.PENDULUM_DISTURBANCES, *presets.ACTION_HISTORY_DISTURBANCES)
@@ -101,7 +102,8 @@ def learning_curves(curves: pd.DataFrame) -> Figure:
             axes.grid(color="#E4E4E4", lw=0.6)
             middle = {"ha": "center", "transform": axes.transAxes}
             if own.empty:
-                axes.text(0.5, 0.5, "not run", va="center", **middle)
+                text = "not run" if in_the_paper(name, agent) else "–"
+                axes.text(0.5, 0.5, text, va="center", **middle)
             else:
                 kept = own.groupby("history_length")["seed"].nunique()
                 alone = ", ".join(f"l = {length}" for length in kept.index[kept.eq(1)])
