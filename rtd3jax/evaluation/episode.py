@@ -21,8 +21,8 @@ from rtd3jax.envs.interface import (
     foreign_code,
 )
 from rtd3jax.envs.registry import description_of
+from rtd3jax.evaluation.play import begin_episodes, checked, take_step
 from rtd3jax.evaluation.rollout import check_counts
-from rtd3jax.policies.compatibility import check_compatible, fitted
 from rtd3jax.protocols import EnvironmentLike, PolicyLike
 from rtd3jax.system.program_cache import make_room
 from rtd3jax.system.pytrees import node_types
@@ -181,11 +181,7 @@ def play_episodes(
         UserError: for an unsuitable environment, or a policy that does not fit it.
     """
     params = parameters_of(env, params)
-    own = describe(env, params)
-    check_compatible(
-        policy, own.observation_size, own.action_shape, own.action_low, own.action_high
-    )
-    policy = fitted(policy, own.action_shape)
+    policy = checked(policy, env, params)
     make_room()
     types = node_types((policy, params))
     frames = _play(policy, env, params, jax.random.key(seed), episodes, steps, hidden, types)
@@ -194,16 +190,11 @@ def play_episodes(
 
 @functools.partial(jax.jit, static_argnames=("env", "episodes", "steps", "hidden", "types"))
 def _play(policy, env, params, key, episodes, steps, hidden, types):
-    # The same keys as in `rtd3jax.evaluation.rollout`, so that the episodes are the same.
-    policy_key, reset_key, step_key = jax.random.split(key, 3)
-    reset_keys = jax.random.split(reset_key, episodes)
-    with foreign_code():
-        observation, state = jax.vmap(env.reset, in_axes=(0, None))(reset_keys, params)
-        true = None
-        if hasattr(env, "true_observation"):
+    memory, state, first, step_key = begin_episodes(policy, env, params, key, episodes)
+    true = None
+    if hasattr(env, "true_observation"):
+        with foreign_code():
             true = jax.vmap(env.true_observation, in_axes=(0, None))(state, params)
-    memory = jax.vmap(policy.init)(jax.random.split(policy_key, episodes))
-    first = observation.astype(jnp.float32)
 
     def step(loop, time):
         memory, state, observation = loop
@@ -211,25 +202,23 @@ def _play(policy, env, params, key, episodes, steps, hidden, types):
         met = None
         if hidden is not None:
             met = hidden(state.env if isinstance(env, Disturbed) else state)
-        keys = jax.random.split(jax.random.fold_in(step_key, time), episodes)
-        with foreign_code():
-            observation, state, reward, terminated, truncated, info = jax.vmap(
-                env.step, in_axes=(0, 0, 0, None)
-            )(keys, state, action, params)
+        observation, state, reward, terminated, truncated, info = take_step(
+            env, params, step_key, time, state, action
+        )
         seen = info["final_observation"].astype(jnp.float32)
         frame = {
             "seen": seen,
             "action": action.reshape(episodes, -1).astype(jnp.float32),
-            "reward": jnp.asarray(reward, jnp.float32),
+            "reward": reward,
             "true_reward": jnp.asarray(info.get("true_reward", reward), jnp.float32),
-            "terminated": jnp.asarray(terminated, bool),
-            "truncated": jnp.asarray(truncated, bool),
+            "terminated": terminated,
+            "truncated": truncated,
         }
         if "true_observation" in info:
             frame["true"] = jnp.asarray(info["true_observation"], jnp.float32)
         if met is not None:
             frame["hidden"] = jnp.asarray(met, jnp.float32).reshape(episodes, -1)
-        return (memory, state, observation.astype(jnp.float32)), frame
+        return (memory, state, observation), frame
 
     (_, state, _), frames = jax.lax.scan(
         step, (memory, state, first), jnp.arange(steps, dtype=jnp.int32), length=steps

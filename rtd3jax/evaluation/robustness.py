@@ -16,8 +16,9 @@ from rtd3jax.envs.processes.process import Process
 from rtd3jax.envs.registry import description_of
 from rtd3jax.envs.stress import SIGNAL_STRESSES, Stress
 from rtd3jax.errors import UserError, nearest, short_reason
+from rtd3jax.evaluation.play import check_fits
 from rtd3jax.evaluation.rollout import check_counts, unchecked_returns
-from rtd3jax.policies.compatibility import check_compatible, fitted
+from rtd3jax.policies.compatibility import fitted
 from rtd3jax.policies.impaired import ImpairedPolicy
 from rtd3jax.protocols import EnvironmentLike, PolicyLike
 
@@ -162,13 +163,7 @@ def check_policy(policy: PolicyLike, cases: Sequence[Case], what: str = "") -> N
     """Raise UserError, which begins with ``what``, unless the policy fits the environment."""
     interface = cases[0].interface
     try:
-        check_compatible(
-            policy,
-            interface.observation_size,
-            interface.action_shape,
-            interface.action_low,
-            interface.action_high,
-        )
+        check_fits(policy, interface)
     except UserError as error:
         raise UserError(f"{what}{error}") from error
 

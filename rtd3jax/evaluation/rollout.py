@@ -7,9 +7,9 @@ import jax.numpy as jnp
 
 from rtd3jax.envs.compat.simulated import release
 from rtd3jax.envs.entry import parameters_of
-from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT, describe, foreign_code
+from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT
 from rtd3jax.errors import UserError
-from rtd3jax.policies.compatibility import check_compatible, fitted
+from rtd3jax.evaluation.play import begin_episodes, checked, take_step
 from rtd3jax.protocols import EnvironmentLike, PolicyLike
 from rtd3jax.system.numbers import is_whole
 from rtd3jax.system.program_cache import make_room
@@ -53,15 +53,7 @@ def both_returns(
     """
     check_counts(episodes, seed)
     params = parameters_of(env, params)
-    interface = describe(env, params)
-    check_compatible(
-        policy,
-        interface.observation_size,
-        interface.action_shape,
-        interface.action_low,
-        interface.action_high,
-    )
-    policy = fitted(policy, interface.action_shape)
+    policy = checked(policy, env, params)
     return unchecked_returns(policy, env, int(episodes), int(seed), params)
 
 
@@ -91,15 +83,9 @@ def episode_returns(
     policy: PolicyLike, env: EnvironmentLike, params: object, key: jax.Array, episodes: int
 ) -> tuple[jax.Array, jax.Array]:
     """As `both_returns`, float32 [episodes] each, without checks; for use under jit."""
-    # With partitionable threefry, JAX's default, split(key, 3)[i] is fold_in(key, i). So with the
-    # seed of a lane, one of the episodes meets the disturbance of the lane's first episode, or as
-    # many as the lane has environments. Other keys would change every published return.
-    policy_key, reset_key, step_key = jax.random.split(key, 3)
-    with foreign_code():
-        observation, env_state = jax.vmap(env.reset, in_axes=(0, None))(
-            jax.random.split(reset_key, episodes), params
-        )
-    policy_state = jax.vmap(policy.init)(jax.random.split(policy_key, episodes))
+    policy_state, env_state, observation, step_key = begin_episodes(
+        policy, env, params, key, episodes
+    )
     limit = getattr(params, "max_steps_in_episode", DEFAULT_STEP_LIMIT)
     zeros = jnp.zeros((episodes,), jnp.float32)
 
@@ -110,17 +96,13 @@ def episode_returns(
     def step(loop):
         time, alive, policy_state, env_state, observation, total, true_total = loop
         action, policy_state = jax.vmap(policy.step)(policy_state, observation)
-        keys = jax.random.split(jax.random.fold_in(step_key, time), episodes)
-        with foreign_code():
-            observation, env_state, reward, terminated, truncated, info = jax.vmap(
-                env.step, in_axes=(0, 0, 0, None)
-            )(keys, env_state, action, params)
-        reward = jnp.asarray(reward, jnp.float32)  # or a Python number, if it is constant
+        observation, env_state, reward, terminated, truncated, info = take_step(
+            env, params, step_key, time, env_state, action
+        )
         true = jnp.asarray(info.get("true_reward", reward), jnp.float32)
         total = total + jnp.where(alive, reward, 0.0)
         true_total = true_total + jnp.where(alive, true, 0.0)
-        alive = alive & ~(jnp.asarray(terminated, bool) | jnp.asarray(truncated, bool))
-        observation = observation.astype(jnp.float32)
+        alive = alive & ~(terminated | truncated)
         return (
             time + jnp.int32(1),
             alive,
@@ -136,7 +118,7 @@ def episode_returns(
         jnp.ones((episodes,), bool),
         policy_state,
         env_state,
-        observation.astype(jnp.float32),
+        observation,
         zeros,
         zeros,
     )
