@@ -7,6 +7,7 @@ or steps, it also trains those.
 
 import argparse
 import collections
+import dataclasses
 import functools
 import signal
 import sys
@@ -94,14 +95,42 @@ def _on_termination(handler: Any) -> Any:
 def _run(options: argparse.Namespace) -> int:
     if options.status:
         return _status(sweep_options.out(options))
+    plan = _plan(options)
+    return _dry_run(plan, options) if options.dry_run else _train(plan, options)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Plan:
+    """What the command will do.
+
+    Attributes:
+        directory: the run directory, in which nothing is written yet.
+        jobs: a job for each lane of the study, also for those that have ended.
+        strategy: ``map`` or ``vmap``.
+        interval: between checkpoints, (seconds, steps).
+        shard: the share of this process, if the lanes are divided by ``--shard``.
+        shares: how processes of this machine divide the lanes.
+        additions: a message about what is added to an existing study.
+    """
+
+    directory: RunDirectory
+    jobs: list[Job]
+    strategy: str
+    interval: tuple[float | None, int | None]
+    shard: tuple[int, int] | None
+    shares: Shares
+    additions: str
+
+
+def _plan(options: argparse.Namespace) -> _Plan:
+    """Read the options; all that is wrong with them raises UserError before a file is written."""
     cells = make_cells(sweep_options.grids(options), sweep_options.overrides(options))
     seeds = list(range(sweep_options.count("seeds", options.seeds)))
     episodes = sweep_options.count("final_episodes", options.final_episodes)
     strategy = check_strategy(options.strategy)
     check_loggers(options.log)
     processes = sweep_options.count("processes", options.processes)
-    divided = options.shard, options.distributed, options.cluster
-    if sum(map(bool, (*divided, processes > 1))) > 1:
+    if sum(map(bool, (*_divided(options), processes > 1))) > 1:
         raise UserError(
             "--processes, --shard, --distributed and --cluster each divide the lanes among "
             "processes: choose one of them"
@@ -114,40 +143,54 @@ def _run(options: argparse.Namespace) -> int:
     jobs = directory.jobs(strategy)
     waiting = [job for job in jobs if options.fresh or not directory.lanes.is_done(*job.key)]
     shares = shares_of(processes, waiting, strategy)
-    # Raises UserError before any file is written.
     interval = sweep_options.parse_interval(options.checkpoint_every)
     shard = _shard(options)
     add_starts(directory, jobs, write=False, fresh=options.fresh)
-    if options.dry_run:
-        say = functools.partial(print, file=sys.stderr, flush=True)
-        print(plan_text(directory.cells, directory.seeds, jobs, strategy, usable_memory(), say))
-        if not any(divided):
-            print(f"trained by {shares}")
-        print(additions, end="\n" if additions else "")
-        return 0
+    return _Plan(directory, jobs, strategy, interval, shard, shares, additions)
+
+
+def _divided(options: argparse.Namespace) -> tuple[Any, ...]:
+    """The options that divide the lanes among processes of several machines."""
+    return options.shard, options.distributed, options.cluster
+
+
+def _dry_run(plan: _Plan, options: argparse.Namespace) -> int:
+    """Print the plan."""
+    directory, memory = plan.directory, usable_memory()
+    say = functools.partial(print, file=sys.stderr, flush=True)
+    print(plan_text(directory.cells, directory.seeds, plan.jobs, plan.strategy, memory, say))
+    if not any(_divided(options)):
+        print(f"trained by {plan.shares}")
+    print(plan.additions, end="\n" if plan.additions else "")
+    return 0
+
+
+def _train(plan: _Plan, options: argparse.Namespace) -> int:
+    """Train the lanes of the plan, and write the results."""
+    directory, jobs = plan.directory, plan.jobs
     if options.cluster:  # the nodes of the cluster need the memory, not this machine
         at_once = len(jobs)
     else:
-        at_once = lanes_at_once(jobs, strategy, len(workers()), usable_memory())
+        at_once = lanes_at_once(jobs, plan.strategy, len(workers()), usable_memory())
     if options.fresh:
-        _set_aside(out)
+        _set_aside(directory.path)
     if additions := directory.prepare():
         print(additions)
     work = Work(
-        strategy,
+        plan.strategy,
         at_once,
-        interval,
+        plan.interval,
         quiet=options.quiet,
         page=options.report,
         keep=options.keep_checkpoints,
     )
     complaints: list[str] = []
-    with writer(directory.path, shard) as handles:
+    with writer(directory.path, plan.shard) as handles:
         if directory.refresh():  # another process has changed the study in the meantime
-            jobs = directory.jobs(strategy)
-        jobs = _share(jobs, shard, options)
+            jobs = directory.jobs(plan.strategy)
+        jobs = _share(jobs, plan.shard, options)
         references = references_of(directory.cells)
-        train = _trainer(options, shares, handles)
+        train = _trainer(options, plan.shares, handles)
         with open_loggers(options.log, directory) as logger:
             try:
                 train(directory, jobs, work, complaints, references, logger)
