@@ -63,6 +63,8 @@ TEST_EPISODES = 1_000
 EARLIER_EPISODES = 20
 """Values for rows of an old table without these columns."""
 REFERENCE_EPISODES = 1_000
+FAILED = -0.1
+"""An agent with a lower normalised return is worse than uniform random actions."""
 
 
 @functools.cache
@@ -195,6 +197,19 @@ def facts(lanes: pd.DataFrame, began: float) -> dict[str, object]:
     )
 
 
+def failed(lanes: pd.DataFrame) -> dict[str, str]:
+    """How many trainings of each agent ended below `FAILED`, under the disturbances of all agents.
+
+    Earlier settings do not count.
+    """
+    own = lanes[
+        lanes["disturbance"].isin(presets.PENDULUM_DISTURBANCES)
+        & (lanes["setting"] == lanes["algorithm"].map(current_setting))
+    ]
+    worse = (own["normalised"] < FAILED).groupby(own["algorithm"]).agg(["sum", "count"])
+    return {str(name): f"{low} of {count}" for name, low, count in worse.itertuples()}
+
+
 def curves_of(run: pathlib.Path) -> pd.DataFrame:
     """Normalised learning curves of a run directory: a row per lane and evaluation."""
     directory = RunDirectory.open(run)
@@ -226,7 +241,8 @@ def report(options: argparse.Namespace, episodes: int, began: float) -> int:
     lanes["episodes"] = lanes["episodes"].fillna(EARLIER_EPISODES).astype(int)
     filtered = filter_returns(options.out)
     text = table(lanes, "disturbance", ALL_DISTURBANCES, filtered)
-    write_results(options.out, "pendulum", lanes, text, facts(lanes, began))
+    about = {**facts(lanes, began), f"trainings_below_{FAILED}": failed(lanes)}
+    write_results(options.out, "pendulum", lanes, text, about)
     curves = pd.concat([curves_of(run) for run in found], ignore_index=True)
     curves_file = options.out / "pendulum_curves.parquet"
     with_others(curves, curves_file, "disturbance").to_parquet(curves_file, index=False)

@@ -198,6 +198,20 @@ def test_facts_name_the_cells_with_other_numbers_of_seeds():
     assert pendulum.of_each(equal, "seeds") == {"noise": "5"}
 
 
+def test_failed_trainings_are_counted_under_the_disturbances_of_all_agents():
+    pendulum = load(EXPERIMENTS / "pendulum.py")
+    now = pendulum.current_setting
+    rows = [
+        ("td3", "noise", -0.2, now("td3")),
+        ("td3", "hidden", 0.0, now("td3")),
+        ("td3", "noise:sigma=1.0", -0.5, now("td3")),  # the paper only has two agents there
+        ("td3", "noise", -0.2, "an earlier setting"),
+        ("h-td3", "hidden", -0.09, now("h-td3")),
+    ]
+    lanes = pd.DataFrame(rows, columns=["algorithm", "disturbance", "normalised", "setting"])
+    assert pendulum.failed(lanes) == {"h-td3": "0 of 1", "td3": "1 of 2"}
+
+
 def test_the_pendulum_experiment_runs(tmp_path, capsys, monkeypatch):
     pendulum = load(EXPERIMENTS / "pendulum.py")
     best = pendulum.rtd.Ceiling(-136.0, 0.5, "exact")
