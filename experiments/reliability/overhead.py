@@ -33,7 +33,7 @@ def seconds_to_write(algorithm: str, capacity: int, repeats: int) -> tuple[float
         times = []
         for step in range(repeats):
             began = time.perf_counter()
-            checkpoints.save([(job, state)], job, step)
+            checkpoints.save_lane(job, state, step)
             times.append(time.perf_counter() - began)
         size = max(file.stat().st_size for file in pathlib.Path(name).iterdir())
     return statistics.median(times), size / 2**20
