@@ -5,8 +5,7 @@ Usage: python experiments/pendulum_figures.py [--results DIR] [--out DIR]
 The script reads pendulum.parquet, pendulum_curves.parquet and generalisation.parquet. It writes the
 following figures as PNG and SVG, if the tables have rows for them:
 
-* pendulum_learning_curves: rows are disturbances, columns are agents, a curve per length; a dash is
-  for agents that the paper does not show under the disturbance;
+* pendulum_learning_curves: rows are disturbances, columns are agents, a curve per length;
 * pendulum: final return for each agent, a line per length; dots are seeds; the dashed line is a
   Bayes filter that knows the process;
 * action_history: `lstm-td3` with and without past actions, a panel per length;
@@ -102,7 +101,7 @@ def learning_curves(curves: pd.DataFrame) -> Figure:
             axes.grid(color="#E4E4E4", lw=0.6)
             middle = {"ha": "center", "transform": axes.transAxes}
             if own.empty:
-                text = "not run" if in_the_paper(name, agent) else "–"
+                text = "not run" if in_the_paper(name, agent) else "not in the paper"
                 axes.text(0.5, 0.5, text, va="center", **middle)
             else:
                 kept = own.groupby("history_length")["seed"].nunique()
