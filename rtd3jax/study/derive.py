@@ -12,7 +12,7 @@ import numpy as np
 from rtd3jax.study.ceilings import ceilings_of
 from rtd3jax.study.figures import final_returns, learning_curves
 from rtd3jax.study.lock import deriver
-from rtd3jax.study.results import CELL, REFERENCE_SEED, read_table, write_table
+from rtd3jax.study.results import REFERENCE_SEED, read_table, write_table
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.summary import summary_markdown
 from rtd3jax.study.tables import SCHEMAS, rows_of_lanes
@@ -50,7 +50,7 @@ def _derive(directory: RunDirectory, references: Iterable[Reference], pictures: 
         tables[name] = read_table(path, schema)
     best = ceilings_of(directory.path, directory.cells, compute=False)
     curves, episodes = tables["curves"], tables["episodes"]
-    planned = {tuple(cell.key[name] for name in CELL): directory.seeds for cell in directory.cells}
+    planned = {tuple(cell.key.values()): directory.seeds for cell in directory.cells}
     text = summary_markdown(_excerpt(directory), planned, episodes, rows.failures, best)
     write_bytes_atomically(directory.path / "summary.md", text.encode())
     if pictures:

@@ -120,9 +120,9 @@ def _start(directory: RunDirectory, cell: Cell, seed: int, disturbance: str) -> 
     if seed not in directory.seeds:
         raise UserError(f"{path} has no seed {seed} to begin from; its seeds are {directory.seeds}")
     where = f"{path} {other.env} {other.disturbance}"
-    kept = checkpoint_files(directory.lanes.checkpoint_directory(other, seed))
-    steps = checkpoint_steps(directory.lanes.checkpoint_directory(other, seed))
+    place = directory.lanes.checkpoint_directory(other, seed)
+    steps = checkpoint_steps(place)
     # A sweep that was killed may leave a checkpoint of an earlier step beside the trained policy.
     if directory.lanes.is_done(other, seed) and steps and steps[0] >= other.config.total_steps:
-        return Start(where, checkpoint=kept[0])
+        return Start(where, checkpoint=checkpoint_files(place)[0])
     return Start(where, policy=directory.lanes.policy(other, seed))

@@ -134,7 +134,7 @@ def _later_lanes(
     there = {
         lane
         for name in ("curves", "episodes")
-        for lane in tables[name][[*CELL, "seed"]].itertuples(index=False, name=None)
+        for lane in tables[name][[*CELL, "seed"]].drop_duplicates().itertuples(False, None)
     }
     found = []
     for cell in directory.cells:

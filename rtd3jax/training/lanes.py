@@ -383,11 +383,11 @@ def _restore(group: Group, checkpoints: Checkpoints, device: jax.Device) -> None
         checkpoints.note(group, step)
 
 
-def _together(states: Sequence[LaneState]) -> LaneState:
-    """The state of a group; several lanes get a leading axis."""
-    if len(states) == 1:
-        return states[0]
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+def _together(trees: Sequence[Any]) -> Any:
+    """The tree of a group, from those of its lanes; several lanes get a leading axis."""
+    if len(trees) == 1:
+        return trees[0]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
 
 
 def _advanced(group: Group, state: LaneState, step: int) -> None:
@@ -401,9 +401,7 @@ def _advanced(group: Group, state: LaneState, step: int) -> None:
 
 def stacked(lanes: Sequence[Lane], device: jax.Device) -> Lane:
     """The lanes on a device; several lanes get a leading axis."""
-    one = len(lanes) == 1
-    lane = lanes[0] if one else jax.tree.map(lambda *leaves: jnp.stack(leaves), *lanes)
-    return jax.device_put(lane, device)
+    return jax.device_put(_together(lanes), device)
 
 
 def _chunk(group: Group, device: jax.Device, rates: dict[Any, float]) -> None:
