@@ -79,16 +79,18 @@ _OWN_FIELDS = ("env", "disturbance")
 def make_cells(grids: Iterable[Grid], overrides: dict[str, Any]) -> list[Cell]:
     """The distinct cells of ``grids``, in order; ``overrides`` are fields of all configurations."""
     cells: dict[Cell, None] = {}
-    for grid in grids:
-        combinations = itertools.product(grid.disturbances, grid.algorithms, grid.history_lengths)
-        for disturbance, algorithm, length in combinations:
-            with warnings.catch_warnings():
-                # Several lengths only apply to agents with windows; td3 occurs once.
-                warnings.simplefilter("ignore")
+    with warnings.catch_warnings():
+        # Several lengths only apply to agents with windows; td3 occurs once.
+        warnings.filterwarnings("ignore", message="history_length=")
+        for grid in grids:
+            combinations = itertools.product(
+                grid.disturbances, grid.algorithms, grid.history_lengths
+            )
+            for disturbance, algorithm, length in combinations:
                 own = grid.own_settings.get(algorithm, {})
                 settings = {**grid.settings, **own, **overrides}
                 config = Config(algorithm=algorithm, history_length=length, **settings)
-            cells[Cell(grid.env, disturbance, config)] = None
+                cells[Cell(grid.env, disturbance, config)] = None
     if not cells:
         raise UserError("the sweep has no cells: every list needs at least one entry")
     return list(cells)

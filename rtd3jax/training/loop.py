@@ -7,6 +7,7 @@ the next step on, because then the agent has acted on the next observation.
 import dataclasses
 import functools
 import math
+import warnings
 from typing import Any
 
 import jax
@@ -484,9 +485,11 @@ def make_program(
     Segments, which begin with a stored carry, use the burn-in of their own configuration.
     """
     defaults = {name: getattr(Config, name) for name in traced_fields()}
-    static = dataclasses.replace(config, **defaults, start=config.start and "trained")
     if window is not None and config.has_window and config.replay == "windows":
-        static = dataclasses.replace(static, history_length=window)
+        defaults["history_length"] = window
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the configuration has given its warnings already
+        static = dataclasses.replace(config, **defaults, start=config.start and "trained")
     return Program(env, static, observation_size, action_shape, true_observation_size)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import rtd3jax as rtd
+from rtd3jax.study.plan import Grid, cell_jobs, make_cells
 from rtd3jax.training.run import make_jobs
 
 
@@ -60,3 +61,20 @@ def test_the_default_length_divides_the_batch(batch_size, length):
 def test_a_gradient_of_the_burn_in_without_a_burn_in_is_a_warning():
     with pytest.warns(UserWarning, match="burn_in_gradient=True has no effect: windows have no"):
         rtd.Config("lstm-td3", burn_in_gradient=True)
+
+
+def test_a_training_does_not_repeat_the_warnings_of_its_configuration():
+    with pytest.warns(UserWarning, match="burn_in_gradient=True"):
+        config = rtd.Config("lstm-td3", burn_in_gradient=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert make_jobs(rtd.make("rover", "none"), config, [0])[0].program.config.burn_in_gradient
+
+
+def test_cells_of_a_sweep_give_a_warning_once_in_all():
+    grid = Grid("rover", ("none", "ar1-slip"), ("td3", "lstm-td3"), (1, 3))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("default")  # Python's own, by which a line is shown once
+        jobs = cell_jobs(make_cells([grid], {"burn_in_gradient": True}), [0], "vmap")
+    assert len(jobs) == 6
+    assert [str(one.message).split()[0] for one in caught] == ["burn_in_gradient=True"]
