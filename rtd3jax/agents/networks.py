@@ -17,6 +17,7 @@ from rtd3jax.agents.history import History, Segment, Steps, Window, flat
 from rtd3jax.agents.memory.base import Carry, Memory, Params, check_memory
 from rtd3jax.agents.parameters import own_parameters
 from rtd3jax.agents.products import matmul
+from rtd3jax.agents.rows import where_rows
 from rtd3jax.errors import UserError, short_reason
 from rtd3jax.registries import MEMORIES
 
@@ -312,8 +313,7 @@ def segment_carries(
 
     def before(last: jax.Array, after: jax.Array) -> jax.Array:
         earlier = jnp.concatenate((last[None], after[:-1]))
-        starts = segment.starts[own].reshape(*earlier.shape[:2], *[1] * (earlier.ndim - 2))
-        return jnp.where(starts, 0.0, earlier)
+        return where_rows(segment.starts[own], 0.0, earlier)
 
     return jax.tree.map(flat, jax.tree.map(before, last, after)), jax.tree.map(flat, after)
 

@@ -8,6 +8,7 @@ Shapes: ``C`` capacity, ``B`` batch, ``H`` width.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 
 import jax
@@ -27,6 +28,7 @@ from rtd3jax.agents.history import (
     window_at,
 )
 from rtd3jax.agents.memory.base import Carry
+from rtd3jax.agents.rows import where_rows
 
 
 @struct.dataclass
@@ -195,8 +197,7 @@ def keep_acting_carry(
 
     def rows(kept: jax.Array, new: jax.Array) -> jax.Array:
         there = jax.lax.dynamic_slice_in_dim(kept, slot, replay.environments, axis=0)
-        begins = (episode_step == 0).reshape(-1, *[1] * (new.ndim - 1))
-        return jnp.where(begins, there, new)
+        return where_rows(episode_step == 0, there, new)
 
     return put_carries(replay, first, jax.tree.map(rows, replay.carries, carry))
 
@@ -427,9 +428,7 @@ def _stored_carries(
     if replay.carries is None:
         return None, None
     carry = jax.tree.map(
-        lambda part: jnp.where(
-            (episode_step == 0).reshape(-1, *[1] * (part.ndim - 1)), jnp.zeros_like(part), part
-        ),
+        functools.partial(where_rows, episode_step == 0, 0.0),
         _carry_at(replay.carries, step_number),
     )
     return carry, _carry_at(replay.carries, step_number + replay.environments)

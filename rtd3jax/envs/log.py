@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -70,18 +70,20 @@ def _read_table(path: str | os.PathLike) -> "pd.DataFrame":
     """The table of a CSV or Parquet file."""
     import pandas as pd
 
+    from rtd3jax.system.parquet import read_parquet
+
     file = user_path(path)
-    readers = {".csv": pd.read_csv, ".parquet": pd.read_parquet, ".pq": pd.read_parquet}
-    read: Any = readers.get(file.suffix.lower())
-    if read is None:
+    kind = file.suffix.lower()
+    if kind not in (".csv", ".parquet", ".pq"):
         raise UserError(f"{path} is neither a .csv nor a .parquet file: write the log as either")
     try:
         if file.is_file() and file.stat().st_size == 0:
             raise UserError(f"{path} is empty: it needs a line of column names and rows of numbers")
-        # By a handle, because PyArrow does not take a path whose bytes are not text.
+        if kind != ".csv":
+            return read_parquet(path).to_pandas()
         with file.open("rb") as handle:
-            table = read(handle)
-        if read is pd.read_csv and not isinstance(table.index, pd.RangeIndex):
+            table = pd.read_csv(handle)
+        if not isinstance(table.index, pd.RangeIndex):
             raise UserError(
                 f"{path} has rows with more cells than its line of column names (a comma at the "
                 "end of the rows, or commas as decimal signs?): write as many cells in each"

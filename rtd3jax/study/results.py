@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 
 from rtd3jax.errors import UserError
 from rtd3jax.system.files import user_path, write_bytes_atomically
+from rtd3jax.system.parquet import read_parquet
 
 # Reference policies need no training: uniform random, and the baselines of the environment. Their
 # EPISODES rows have history_length 0 and this seed, because neither has a meaning for them.
@@ -110,12 +111,7 @@ def read_table(path: str | os.PathLike, schema: pa.Schema | None = None) -> pd.D
     path = user_path(path)
     if not path.is_file():
         raise UserError(f"no results table at {path}")
-    try:
-        # By a handle, because PyArrow does not take a path whose bytes are not text.
-        with path.open("rb") as handle:
-            table = pq.ParquetFile(handle, page_checksum_verification=True).read()
-    except (pa.ArrowException, OSError) as error:
-        raise UserError(f"{path} is not a readable Parquet file: {error}") from error
+    table = read_parquet(path)
     expected = [CURVES, EPISODES, METRICS] if schema is None else [schema]
     if not any(table.schema.equals(candidate) for candidate in expected):
         wanted = " or ".join(_describe(candidate) for candidate in expected)

@@ -31,6 +31,7 @@ from rtd3jax.agents.replay import (
     present_window,
     store,
 )
+from rtd3jax.agents.rows import where_rows
 from rtd3jax.config import Config, traced_fields
 from rtd3jax.envs.compat.simulated import innermost
 from rtd3jax.envs.compat.simulator_state import simulator_state, with_simulator
@@ -269,11 +270,9 @@ class Program:
             true_statistics=true_statistics,
             env_state=env_state,
             observation=observation.astype(jnp.float32),
-            previous_action=jnp.where(done[:, None], 0.0, action),
+            previous_action=where_rows(done, 0.0, action),
             episode_step=jnp.where(done, 0, state.episode_step + 1).astype(jnp.int32),
-            carry=jax.tree.map(
-                lambda part: jnp.where(done.reshape(-1, *[1] * (part.ndim - 1)), 0.0, part), carry
-            ),
+            carry=jax.tree.map(functools.partial(where_rows, done, 0.0), carry),
             metrics=note_reward(metrics, reward, done),
         )
         at = step * self.config.environments

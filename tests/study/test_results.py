@@ -151,7 +151,7 @@ def test_a_missing_file_is_named(tmp_path):
 
 def test_a_file_that_is_not_parquet_is_refused(tmp_path):
     (tmp_path / "t.parquet").write_bytes(b"not a table at all")
-    with pytest.raises(UserError, match="not a readable Parquet"):
+    with pytest.raises(UserError, match="cannot be read as a Parquet file"):
         read_table(tmp_path / "t.parquet")
 
 

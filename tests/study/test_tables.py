@@ -105,7 +105,7 @@ def test_a_damaged_lane_or_table_is_named(whole):
     damaged.write_bytes(content)
     (whole.path / "episodes.parquet").write_bytes(b"nothing")
     os.utime(whole.path / "curves.parquet")
-    with pytest.raises(rtd.UserError, match="not a readable Parquet file"):
+    with pytest.raises(rtd.UserError, match="cannot be read as a Parquet file"):
         current_tables(whole)
     notes = []
     assert len(current_tables(whole, notes)["curves"]) == len(expected["curves"])

@@ -3,6 +3,7 @@
 Shapes: ``T`` tokens, ``B`` batch, ``I`` inputs, ``H`` width. Time comes first.
 """
 
+import functools
 from typing import Any
 
 import flax.linen as nn
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from rtd3jax.agents.rows import where_rows
 from rtd3jax.errors import UserError, short_reason
 from rtd3jax.registries import MEMORIES
 
@@ -60,7 +62,7 @@ class Memory(nn.Module):
 
         def step(carry: Carry, x: tuple[jax.Array, jax.Array]) -> tuple[Carry, Carry]:
             token, begins = x
-            carry = jax.tree.map(lambda part: _where(begins, jnp.zeros_like(part), part), carry)
+            carry = jax.tree.map(functools.partial(where_rows, begins, 0.0), carry)
             after = cell.apply(variables, carry, token, method="step")
             return after, after
 
@@ -88,7 +90,7 @@ class Memory(nn.Module):
         starts = first if carry is None else jnp.zeros_like(exists)
         after = jax.tree.map(lambda part: part[-1], self.carries(carry, tokens, starts))
         before = self.zero(tokens.shape[1]) if carry is None else carry
-        return jax.tree.map(lambda new, old: _where(exists[-1], new, old), after, before)
+        return jax.tree.map(functools.partial(where_rows, exists[-1]), after, before)
 
     def initial(self, key: jax.Array) -> Params:
         """Initial parameters."""
@@ -179,8 +181,3 @@ def draw_uniform(key: jax.Array, shapes: dict[str, tuple[int, ...]], bound: floa
 def _shapes(tree: object) -> tuple[Any, list[str]]:
     leaves, structure = jax.tree.flatten(tree)
     return structure, [f"{leaf.dtype}{list(leaf.shape)}" for leaf in leaves]
-
-
-def _where(there: jax.Array, new: jax.Array, old: jax.Array) -> jax.Array:
-    """[B, ...]: ``new`` for tokens that exist, ``old`` for the others."""
-    return jnp.where(there.reshape(-1, *[1] * (new.ndim - 1)), new, old)

@@ -10,6 +10,7 @@ from jax import lax
 from rtd3jax.agents.memory.base import Memory, Params, draw_uniform
 from rtd3jax.agents.parameters import own_parameters
 from rtd3jax.agents.products import matmul
+from rtd3jax.agents.rows import where_rows
 
 
 class GRU(Memory):
@@ -45,7 +46,7 @@ class GRU(Memory):
 
         def step(carry: jax.Array, x: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
             gates, begins = x
-            after = self._cell(jnp.where(begins[:, None], 0.0, carry), gates)
+            after = self._cell(where_rows(begins, 0.0, carry), gates)
             return after, after
 
         start = self.zero(tokens.shape[1]) if carry is None else carry

@@ -18,6 +18,7 @@ from jax import lax
 from rtd3jax.agents.memory.base import Memory, draw_uniform
 from rtd3jax.agents.parameters import own_parameters
 from rtd3jax.agents.products import matmul, narrow, product, weight_gradient
+from rtd3jax.agents.rows import where_rows
 
 Params = dict[str, jax.Array]
 
@@ -150,7 +151,7 @@ def reference(params: Params, inputs: jax.Array, exists: jax.Array, carry: Carry
         i, f, g, o = jnp.split(gates, 4, axis=-1)
         cell = jax.nn.sigmoid(f) * carry.cell + jax.nn.sigmoid(i) * jnp.tanh(g)
         new = Carry(jax.nn.sigmoid(o) * jnp.tanh(cell), cell)
-        carry = Carry(*(jnp.where(there[:, None], n, c) for n, c in zip(new, carry, strict=True)))
+        carry = Carry(*(where_rows(there, n, c) for n, c in zip(new, carry, strict=True)))
     return carry
 
 
@@ -309,4 +310,4 @@ _carries.defvjp(_carries_forward, _carries_backward)
 
 def _reset(carry: Carry, begins: jax.Array) -> Carry:
     """``carry`` [B, H], set to zero at the entries where an episode ``begins`` [B]."""
-    return Carry(*(jnp.where(begins[:, None], jnp.zeros_like(part), part) for part in carry))
+    return Carry(*(where_rows(begins, 0.0, part) for part in carry))

@@ -7,6 +7,7 @@ import pandas as pd
 
 from rtd3jax.errors import UserError
 from rtd3jax.study.rundir import RunDirectory
+from rtd3jax.system.parquet import read_parquet
 
 LANE = "lane"
 """The column with the digest of the lane's file, whose policy was tested."""
@@ -61,12 +62,7 @@ def read_table(path: Path, columns: Sequence[str]) -> pd.DataFrame | None:
     """
     if not path.is_file():
         return None
-    try:
-        # By a handle, because PyArrow does not take a path whose bytes are not text.
-        with path.open("rb") as file:
-            table = pd.read_parquet(file)
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path.name} cannot be read ({str(error).splitlines()[0]})") from error
+    table = read_parquet(path).to_pandas()
     missing = [name for name in columns if name not in table.columns]
     if missing:
         raise UserError(f"{path.name} has no columns {', '.join(missing)}")
