@@ -59,6 +59,8 @@ CONDITIONS = (
 LENGTHS = (6, 20, 1, 3, 10)
 """The paper's lengths, in an order that soon gives a useful figure."""
 ALL_DISTURBANCES = (*presets.PENDULUM_DISTURBANCES, *presets.ACTION_HISTORY_DISTURBANCES)
+SEEDS = 5
+"""The paper's seeds."""
 TEST_EPISODES = 1_000
 EARLIER_EPISODES = 20
 """Values for rows of an old table without these columns."""
@@ -135,19 +137,13 @@ def with_others(lanes: pd.DataFrame, path: pathlib.Path, column: str) -> pd.Data
     return pd.concat([lanes, kept[~replaced]], ignore_index=True)
 
 
-def of_each(lanes: pd.DataFrame, column: str) -> dict[str, str]:
-    """Values of ``column`` for each disturbance; if they differ, by agent, or agent and length."""
-    found = {}
-    for name, here in lanes.groupby("disturbance"):
-        differ = here.groupby("algorithm")[column].transform("nunique") > 1
-        lengths = " l=" + here["history_length"].astype(str)
-        cells = here["algorithm"] + lengths.where(differ, "")
-        parts = [
-            f"{value:,} ({', '.join(sorted(own))})" if here[column].nunique() > 1 else f"{value:,}"
-            for value, own in cells.groupby(here[column]).unique().items()
-        ]
-        found[name] = ", ".join(parts)
-    return found
+def of_each(lanes: pd.DataFrame, column: str) -> str:
+    """The value of ``column`` in most cells, and the agents that have cells with others."""
+    usual = lanes[column].mode()[0]
+    parts = [f"{usual:,}"]
+    for value, own in lanes[lanes[column] != usual].groupby(column):
+        parts.append(f"{', '.join(sorted(own['algorithm'].unique()))}: {value:,}")
+    return "; ".join(parts)
 
 
 def table(
@@ -155,9 +151,9 @@ def table(
 ) -> str:
     """Mean normalised return ± std over seeds: rows are agents and lengths, columns disturbances.
 
-    Cells that were trained with earlier settings are marked; those that no figure of the paper has
-    are dashes. ``filtered`` has the returns of the
-    filter, for a separate row.
+    Cells that do not have `SEEDS` seeds state their number. Cells that were trained with earlier
+    settings are marked; those that no figure of the paper has are dashes. ``filtered`` has the
+    returns of the filter, for a separate row.
     """
     older = lanes["setting"] != lanes["algorithm"].map(current_setting)
     body = []
@@ -170,7 +166,10 @@ def table(
                 values = here["normalised"]
                 dagger = mark(int(older[here.index].sum()), len(here))
                 missing_text = "not run" if in_the_paper(name, algorithm) else "–"
-                line.append(f"{mean_text(values, 3)}{dagger}" if len(values) else missing_text)
+                more = f" ({len(values)})" if len(values) != SEEDS else ""
+                line.append(
+                    f"{mean_text(values, 3)}{more}{dagger}" if len(values) else missing_text
+                )
             body.append(line)
     if filtered:
         known = [f"{filtered[name]:.3f}" if name in filtered else "–" for name in names]
@@ -181,11 +180,10 @@ def table(
 
 def facts(lanes: pd.DataFrame, began: float) -> dict[str, object]:
     """The facts below the table."""
-    cells = lanes.groupby(["algorithm", "history_length", "disturbance"])
     return provenance(
         normalised="0 is the uniform-random policy, 1 the fully observed optimum",
         lanes=len(lanes),
-        seeds=of_each(lanes.assign(seeds=cells["seed"].transform("nunique")), "seeds"),
+        seeds=f"{SEEDS} in each cell; another number is in parentheses",
         lengths=sorted(int(length) for length in lanes["history_length"].unique()),
         steps=of_each(lanes, "steps"),
         width=of_each(lanes, "width"),
@@ -281,7 +279,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--steps", type=int, default=presets.PENDULUM_STEPS, help="h-td3 has twice as many"
     )
-    parser.add_argument("--seeds", type=int, default=5, metavar="N")
+    parser.add_argument("--seeds", type=int, default=SEEDS, metavar="N")
     parser.add_argument("--first-seed", type=int, default=0, metavar="S", help="of the N seeds")
     parser.add_argument("--lengths", type=int, nargs="+", default=[*LENGTHS])
     parser.add_argument("--width", type=int, default=128)

@@ -188,14 +188,21 @@ def test_longer_trainings_of_the_rover_stand_beside_those_of_its_table(tmp_path,
     assert "has 1 of 1 cells" in capsys.readouterr().out
 
 
-def test_facts_name_the_cells_with_other_numbers_of_seeds():
+def test_facts_name_the_agents_with_other_numbers_of_steps():
     pendulum = load(EXPERIMENTS / "pendulum.py")
-    cells = [("td3", 0, 5), ("lstm-td3", 1, 15), ("lstm-td3", 6, 5), ("h-td3", 1, 5)]
-    lanes = pd.DataFrame(cells, columns=["algorithm", "history_length", "seeds"])
-    found = pendulum.of_each(lanes.assign(disturbance="noise"), "seeds")
-    assert found == {"noise": "5 (h-td3, lstm-td3 l=6, td3), 15 (lstm-td3 l=1)"}
-    equal = lanes.assign(disturbance="noise", seeds=5)
-    assert pendulum.of_each(equal, "seeds") == {"noise": "5"}
+    cells = [("td3", 30_000), ("lstm-td3", 30_000), ("lstm-td3", 30_000), ("h-td3", 60_000)]
+    lanes = pd.DataFrame(cells, columns=["algorithm", "steps"])
+    assert pendulum.of_each(lanes, "steps") == "30,000; h-td3: 60,000"
+    assert pendulum.of_each(lanes[lanes["algorithm"] == "td3"], "steps") == "30,000"
+
+
+def test_a_cell_states_another_number_of_seeds():
+    pendulum = load(EXPERIMENTS / "pendulum.py")
+    setting = pendulum.current_setting("td3")
+    lanes = pd.DataFrame({"algorithm": "td3", "history_length": 0, "normalised": 0.5}, range(15))
+    lanes = lanes.assign(disturbance=["noise"] * 5 + ["hidden"] * 10, setting=setting)
+    text = pendulum.table(lanes, "disturbance", ("noise", "hidden"), {})
+    assert "| td3 | – | 0.500 ± 0.000 | 0.500 ± 0.000 (10) |" in text
 
 
 def test_failed_trainings_are_counted_under_the_disturbances_of_all_agents():
