@@ -236,7 +236,7 @@ def test_the_tasks_line_is_json(tmp_path):
 
 def test_the_growing_log_is_read_once_and_by_whole_lines(tmp_path):
     cells = make_cells([Grid("rover", ("ar1-slip",), ("td3",))], {})
-    directory = RunDirectory(tmp_path / "run", cells, [0, 1], 2)
+    directory = RunDirectory.create(tmp_path / "run", cells, [0, 1], 2)
     fed = []
     logger = type("Logger", (), {"log": lambda self, cell, seed, row: fed.append(row["step"])})()
 

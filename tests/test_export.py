@@ -27,7 +27,7 @@ CELLS = [_cell(), _cell(history_length=5), _cell(algorithm="lstm-td3"), _cell("p
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A run directory: seed 0 of every cell is trained, seed 1 of the first was lost."""
-    directory = RunDirectory(tmp_path_factory.mktemp("run"), CELLS, [0, 1, 2], 1)
+    directory = RunDirectory.create(tmp_path_factory.mktemp("run"), CELLS, [0, 1, 2], 1)
     for cell in CELLS:
         policy = random_policy(cell.config.algorithm, cell.make_env(), length=3)
         directory.lanes.write_lane(cell, 0, policy.parameters(), CURVES, {}, None)
@@ -72,7 +72,7 @@ def test_what_cannot_be_chosen_is_named(run, which, message):
 
 
 def test_a_lane_for_another_observation_is_refused(tmp_path):
-    directory = RunDirectory(tmp_path / "run", [_cell("pendulum", "random-sine")], [0], 1)
+    directory = RunDirectory.create(tmp_path / "run", [_cell("pendulum", "random-sine")], [0], 1)
     other = random_policy("h-td3", rtd.make("pendulum", "hidden"))
     directory.lanes.write_lane(directory.cells[0], 0, other.parameters(), CURVES, {}, None)
     with pytest.raises(rtd.UserError, match="does not fit h-td3 with 3 observation elements"):
@@ -93,7 +93,7 @@ def test_a_lane_of_an_environment_that_is_not_registered_is_loaded_and_exported(
     rtd.register("robot", rtd.make("pendulum"), replace=True)
     cell = _cell("robot", "dropout")
     policy = random_policy("h-td3", cell.make_env())
-    directory = RunDirectory(tmp_path / "run", [cell], [0, 1], 1)
+    directory = RunDirectory.create(tmp_path / "run", [cell], [0, 1], 1)
     directory.lanes.write_lane(cell, 0, policy.parameters(), CURVES, {}, None, policy.interface())
     directory.lanes.write_lane(
         cell, 1, policy.parameters(), CURVES, {}, None

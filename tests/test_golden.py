@@ -94,7 +94,7 @@ def test_lanes_are_not_added_to_a_study_whose_agents_read_other_units(tmp_path):
     path = tmp_path / "run"
     shutil.copytree(GOLDEN / "run", path)
     cells, seeds = RunDirectory.open(path).cells, RunDirectory.open(path).seeds
-    RunDirectory(path, cells, seeds, 3)  # complete: nothing would be trained
+    RunDirectory.create(path, cells, seeds, 3)  # complete: nothing would be trained
     next((path / "lanes").rglob("seed-1.safetensors")).unlink()
     with pytest.raises(rtd.UserError, match="begun by rtd3jax 0.1.*choose another directory"):
-        RunDirectory(path, cells, seeds, 3)
+        RunDirectory.create(path, cells, seeds, 3)

@@ -279,7 +279,7 @@ def study(tmp_path):
 
     def make(count, ready=True):
         jobs = lanes_of(2, ("td3", "h-td3"))
-        directory = RunDirectory(
+        directory = RunDirectory.create(
             tmp_path / "run", list(dict.fromkeys(j.cell for j in jobs)), [0, 1], 2
         )
         crew, complaints = FakeCrew(count, ready), []

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from rtd3jax import sweep
+from rtd3jax import compare, report, sweep
 from rtd3jax.agents.variants import ALGORITHMS
 from rtd3jax.config import Config
 from rtd3jax.envs import registry
@@ -105,22 +105,22 @@ def test_a_lost_lane_is_reported_and_the_exit_status_says_so(tmp_path, capsys):
     ("arguments", "message"),
     [
         ("", "choose what to run"),
-        ("--env rovr", "rover"),
-        ("--env rover --disturbances ar1-slipp", "ar1-slip"),
+        ("--env rovr", "did you mean 'rover'"),
+        ("--env rover --disturbances ar1-slipp", "did you mean 'ar1-slip'"),
         ("--env rover --algorithms h-td", "did you mean 'h-td3'"),
-        ("--env CartPole-v1", "action"),
+        ("--env CartPole-v1", "has discrete actions"),
         ("--preset quick --seeds 0", "seeds must be from 1"),
         ("--preset quick --total-steps -1", "total_steps must be at least 1"),
-        ("--preset quick --batch-size 5000", "batch_size"),
-        ("--env pendulum --disturbances noise:sigma=-1", "sigma"),
+        ("--preset quick --batch-size 5000", "is larger than learning_starts"),
+        ("--env pendulum --disturbances noise:sigma=-1", "sigma=-1.0 must be at least 0"),
         ("--preset quick --device gpu", "--device gpu: this machine has none"),
         ("--preset quick --hidden-size 200000", "one lane needs"),
         ("--preset quick --history-lengths 0", "history_length must be at least 1"),
         ("--preset rover --env pendulum", "has settings for rover"),
         ("--preset quick --dry-run --hidden-size 200000", "one lane needs"),
-        ("--preset quick --dry-run --start nowhere", "nowhere"),
+        ("--preset quick --dry-run --start nowhere", "nowhere cannot be read"),
         ("--preset quick --dry-run --shard 9/4", "not of the form i/n"),
-        ("--preset quick --dry-run --checkpoint-every banana", "banana"),
+        ("--preset quick --dry-run --checkpoint-every banana", "'banana' is not like 300s"),
         ("--preset quick --import ./tank.py", "give a module's name: --import tank"),
         ("--preset quick --import=", "--import '': Empty module name"),
     ],
@@ -227,8 +227,9 @@ def test_fresh_does_not_rename_the_working_directory(tmp_path, monkeypatch, caps
 
 def test_an_empty_directory_name_is_refused(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert sweep.main([*TINY, "--out", ""]) == 2
-    assert "--out is empty" in capsys.readouterr().err and not list(tmp_path.iterdir())
+    for command, first in ((sweep, TINY), (report, ["run"]), (compare, ["one", "two"])):
+        assert command.main([*first, "--out", ""]) == 2
+        assert "--out is empty" in capsys.readouterr().err and not list(tmp_path.iterdir())
 
 
 def test_one_damaged_file_does_not_hide_the_others(tmp_path, capsys):

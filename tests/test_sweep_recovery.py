@@ -171,7 +171,7 @@ def test_sigterm_leaves_checkpoints_and_the_rest_is_the_same(whole, tmp_path, mo
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_an_interrupt_between_two_stages_is_one_line(number, status, tmp_path, monkeypatch, capsys):
-    import rtd3jax.cli.sweep as stages
+    import rtd3jax.study.run as stages
 
     def interrupted(cells):
         os.kill(os.getpid(), number)

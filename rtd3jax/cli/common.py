@@ -5,9 +5,11 @@ import io
 import os
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from rtd3jax.errors import UserError
+from rtd3jax.system.files import user_path
 
 
 def replace_unprintable() -> None:
@@ -50,11 +52,11 @@ def exit_status(
     return 2
 
 
-def not_empty(name: str, value: str | None) -> str | None:
-    """The value of an option that names a path, or None; UserError if it is empty."""
+def out_path(value: str | None) -> Path | None:
+    """The path that ``--out`` names, or None; UserError if its value is empty."""
     if value == "":
-        raise UserError(f"--{name} is empty: name a path, or leave it out")
-    return value
+        raise UserError("--out is empty: name a path, or leave it out")
+    return None if value is None else user_path(value)
 
 
 def add_import(group: argparse._ActionsContainer) -> None:

@@ -7,11 +7,11 @@ prints a Markdown table; with --out DIR it also writes DIR/compare.parquet and D
 import argparse
 from collections.abc import Sequence
 
-from rtd3jax.cli.common import add_import, exit_status, not_empty, replace_unprintable
+from rtd3jax.cli.common import add_import, exit_status, out_path, replace_unprintable
 from rtd3jax.errors import UserError
 from rtd3jax.study.comparison import MEASURES, compare_runs, comparison_markdown, differing_settings
 from rtd3jax.study.rundir import RunDirectory
-from rtd3jax.system.files import user_path, write_bytes_atomically
+from rtd3jax.system.files import write_bytes_atomically
 from rtd3jax.system.imports import import_modules
 
 
@@ -23,6 +23,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     import_modules(options.imports)
+    out = out_path(options.out)
+    if out is not None and out.exists() and not out.is_dir():
+        raise UserError(f"{out} is a file: --out must name a directory")
     directories = [RunDirectory.open(run) for run in options.runs]
     names = _short_names([str(directory.path.resolve()) for directory in directories])
     measure = MEASURES[options.true_return]
@@ -30,10 +33,7 @@ def _run(options: argparse.Namespace) -> int:
     settings = differing_settings(directories, names, table)
     text = comparison_markdown(table, names, settings, measure)
     print(text, end="")
-    if (given := not_empty("out", options.out)) is not None:
-        out = user_path(given)
-        if out.exists() and not out.is_dir():
-            raise UserError(f"{out} is a file: --out must name a directory")
+    if out is not None:
         write_bytes_atomically(out / "compare.parquet", table.to_parquet(index=False))
         write_bytes_atomically(out / "compare.md", text.encode())
         print(f"\nresults: {out / 'compare.parquet'}, {out / 'compare.md'}")

@@ -3,7 +3,7 @@
 import argparse
 from collections.abc import Sequence
 
-from rtd3jax.cli.common import exit_status, not_empty, run_parser
+from rtd3jax.cli.common import exit_status, out_path, run_parser
 from rtd3jax.policies.export.formats import FORMATS
 from rtd3jax.policies.load import load_policy
 from rtd3jax.policies.trained import Policy
@@ -31,7 +31,7 @@ def _run(options: argparse.Namespace) -> int:
         disturbance=options.disturbance,
         history_length=options.history_length,
     )
-    path = user_path(not_empty("out", options.out) or _default_name(policy, options))
+    path = out_path(options.out) or user_path(_default_name(policy, options))
     if options.format == POLICY:
         policy.save(path, overwrite=options.force)
     else:

@@ -7,10 +7,9 @@ an earlier version.
 import argparse
 from collections.abc import Sequence
 
-from rtd3jax.cli.common import exit_status, run_parser
+from rtd3jax.cli.common import exit_status, out_path, run_parser
 from rtd3jax.study.report.page import NAME, write_page
 from rtd3jax.study.rundir import RunDirectory
-from rtd3jax.system.files import user_path
 from rtd3jax.system.imports import import_modules
 
 
@@ -22,8 +21,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     import_modules(options.imports)
+    out = out_path(options.out)
     directory = RunDirectory.open(options.run)
-    out = None if options.out is None else user_path(options.out)
     path = write_page(directory, out, playback=options.playback)
     print(f"{path}: {path.stat().st_size / 2**20:.1f} MiB")
     return 0

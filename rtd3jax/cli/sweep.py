@@ -12,7 +12,7 @@ import functools
 import signal
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,24 +23,20 @@ from rtd3jax.cli.common import exit_status
 from rtd3jax.errors import UserError
 from rtd3jax.study.cluster import train_on_cluster
 from rtd3jax.study.execute import Work, train_here
-from rtd3jax.study.finish import finish
 from rtd3jax.study.hosts import own_shard, own_share, relaunch
 from rtd3jax.study.lock import parse_shard, writer
-from rtd3jax.study.loggers import check_loggers, open_loggers
+from rtd3jax.study.loggers import check_loggers
 from rtd3jax.study.memory_plan import lanes_at_once, usable_memory
 from rtd3jax.study.plan import make_cells, plan_text
 from rtd3jax.study.process_plan import Shares, shares_of
 from rtd3jax.study.processes import train_in_processes
-from rtd3jax.study.references import references_of
+from rtd3jax.study.run import Trainer, run_study
 from rtd3jax.study.rundir import RunDirectory, holds_study
 from rtd3jax.study.starts import add_starts, check_starts_stay
 from rtd3jax.study.status import ledger
 from rtd3jax.system.imports import import_modules
 from rtd3jax.training.lanes import Job, workers
 from rtd3jax.training.run import check_strategy
-
-Trainer = Callable[..., None]
-"""`train_here`, or another function with the same arguments."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -136,7 +132,7 @@ def _plan(options: argparse.Namespace) -> _Plan:
             "processes: choose one of them"
         )
     out = sweep_options.out(options)
-    directory = RunDirectory(out, cells, seeds, episodes, prepare=False)
+    directory = RunDirectory(out, cells, seeds, episodes)
     if options.fresh and holds_study(out):
         check_starts_stay(cells, out)
     additions = "" if options.fresh else directory.plan()
@@ -184,22 +180,16 @@ def _train(plan: _Plan, options: argparse.Namespace) -> int:
         page=options.report,
         keep=options.keep_checkpoints,
     )
-    complaints: list[str] = []
-    with writer(directory.path, plan.shard) as handles:
-        if directory.refresh():  # another process has changed the study in the meantime
-            jobs = directory.jobs(plan.strategy)
-        jobs = _share(jobs, plan.shard, options)
-        references = references_of(directory.cells)
-        train = _trainer(options, plan.shares, handles)
-        with open_loggers(options.log, directory) as logger:
-            try:
-                train(directory, jobs, work, complaints, references, logger)
-                interrupted = 0
-            except KeyboardInterrupt as interrupt:
-                interrupted = _status_of(interrupt)
-    # Without the lock, so that the page does not show lanes that were interrupted as running.
-    finish(directory, references, page=options.report, interrupted=bool(interrupted))
-    return _conclude(directory, complaints, interrupted)
+    complaints, interrupt = run_study(
+        directory,
+        jobs,
+        work,
+        log=options.log,
+        shard=plan.shard,
+        share=functools.partial(_share, shard=plan.shard, options=options),
+        trainer=functools.partial(_trainer, options, plan.shares),
+    )
+    return _conclude(directory, complaints, _status_of(interrupt) if interrupt else 0)
 
 
 def _shard(options: argparse.Namespace) -> tuple[int, int] | None:

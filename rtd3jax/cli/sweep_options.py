@@ -10,7 +10,7 @@ from typing import Any, Literal, NoReturn, get_args, get_origin
 import jax
 
 from rtd3jax.agents.variants import ALGORITHMS
-from rtd3jax.cli.common import add_import, not_empty, replace_unprintable
+from rtd3jax.cli.common import add_import, out_path, replace_unprintable
 from rtd3jax.config import Config
 from rtd3jax.envs.builtin import LISTED
 from rtd3jax.errors import UserError
@@ -18,7 +18,6 @@ from rtd3jax.registries import AGENTS
 from rtd3jax.study.loggers import LOGGERS
 from rtd3jax.study.plan import Grid
 from rtd3jax.study.presets import PRESETS
-from rtd3jax.system.files import user_path
 
 _GRID_FIELDS = ("algorithm", "history_length")
 
@@ -190,16 +189,16 @@ def overrides(options: argparse.Namespace) -> dict[str, Any]:
 
 def out(options: argparse.Namespace) -> Path:
     """The run directory."""
-    given = not_empty("out", options.out)
+    given = out_path(options.out)
     if not (given or options.preset or options.env):
         raise UserError("name the run directory: --out DIR")
-    return user_path(given or Path("runs") / (options.preset or options.env))
+    return given or Path("runs") / (options.preset or options.env)
 
 
-def count(name: str, value: int, most: int = 100_000) -> int:
-    """``value``; raises UserError unless it is from 1 to ``most``."""
-    if not 1 <= value <= most:
-        raise UserError(f"{name} must be from 1 to {most:,}, not {value}")
+def count(name: str, value: int) -> int:
+    """``value``; raises UserError unless it is from 1 to 100,000."""
+    if not 1 <= value <= 100_000:
+        raise UserError(f"{name} must be from 1 to 100,000, not {value}")
     return value
 
 

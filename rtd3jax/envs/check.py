@@ -296,7 +296,7 @@ def _scales(record: _Record) -> Iterator[Finding]:
 
 def _pure(env: EnvironmentLike, params: object, record: _Record, seed: int) -> Iterator[Finding]:
     """Finds a reset or a step whose result changes for equal arguments."""
-    state, action = _pick((record.last_state, record.last_action), 0)
+    state, action = _first((record.last_state, record.last_action))
 
     def both() -> tuple:
         key = jax.random.key(seed)
@@ -388,7 +388,7 @@ def _leaks(env: EnvironmentLike, params: object, record: _Record, seed: int) -> 
         first, state, _, terminated, truncated, _ = env.step(key, state, action, params)
 
         def step(state: object, key: jax.Array) -> tuple:
-            seen, state, reward, *_ = env.step(key, state, _pick(record.last_action, 0), params)
+            seen, state, reward, *_ = env.step(key, state, _first(record.last_action), params)
             return state, (seen, reward)
 
         played: Any = jax.lax.scan(step, state, jax.random.split(key, AFTER_RESET))
@@ -404,8 +404,8 @@ def _leaks(env: EnvironmentLike, params: object, record: _Record, seed: int) -> 
         )
 
 
-def _pick(tree: object, index: int) -> Any:
-    return jax.tree.map(lambda leaf: leaf[index], tree)
+def _first(tree: object) -> Any:
+    return jax.tree.map(lambda leaf: leaf[0], tree)
 
 
 def _close(one: ArrayLike, other: ArrayLike) -> bool:

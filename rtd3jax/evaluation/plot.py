@@ -6,7 +6,7 @@ import numpy as np
 
 from rtd3jax.errors import UserError
 from rtd3jax.evaluation.episode import Trajectory
-from rtd3jax.evaluation.style import STYLE
+from rtd3jax.evaluation.style import BLACK, GREY, PALETTE, STYLE
 from rtd3jax.system.numbers import is_whole
 
 if TYPE_CHECKING:  # importing matplotlib takes two seconds
@@ -16,9 +16,9 @@ if TYPE_CHECKING:  # importing matplotlib takes two seconds
 MOST_PANELS = 6
 """Largest number of elements that get a panel each; more elements share one panel."""
 
-_TRUE, _SEEN, _OTHER = "#222222", "#D55E00", "#0072B2"
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#222222", "#999999")
-"""Colours of the lines in a panel, which colour-blind readers can distinguish."""
+_TRUE, _SEEN, _OTHER = BLACK, PALETTE[1], PALETTE[0]
+_COLOURS = (*PALETTE, BLACK, GREY)
+"""Colours of the lines in a panel."""
 
 _STYLE: Any = {**STYLE, "legend.fontsize": 8.0}
 
@@ -148,7 +148,7 @@ def _draw_bounds(axis: "Axes", values: np.ndarray, trajectory: Trajectory, k: in
     low, high = float(trajectory.action_low[k]), float(trajectory.action_high[k])
     for bound, near in ((low, values.min() - low), (high, high - values.max())):
         if near < 0.05 * (high - low):
-            axis.axhline(bound, color="#999999", linewidth=0.8, linestyle=(0, (4, 2)))
+            axis.axhline(bound, color=GREY, linewidth=0.8, linestyle=(0, (4, 2)))
 
 
 def _times(trajectory: Trajectory, rows: int) -> np.ndarray:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rtd3jax.errors import UserError
-from rtd3jax.evaluation.style import STYLE
+from rtd3jax.evaluation.style import GREY, PALETTE, STYLE
 from rtd3jax.registries import AGENTS
 
 if TYPE_CHECKING:  # importing matplotlib takes two seconds
@@ -15,12 +15,11 @@ if TYPE_CHECKING:  # importing matplotlib takes two seconds
     from matplotlib.figure import Figure
 
 _COLUMNS = ("policy", "stress", "quantity", "value", "return", "standard_error")
-_OTHERS = ("#56B4E9", "#CC79A7", "#E69F00", "#009E73", "#D55E00", "#0072B2", "#999999")
-"""Colours of policies that are not agents: the palette of `rtd3jax.agents.variants`."""
+_OTHERS = (*reversed(PALETTE), GREY)
+"""Colours of policies that are not agents."""
 _DASHES: tuple[Any, ...] = ("solid", (0, (5, 2)), (0, (1, 1)), (0, (5, 2, 1, 2)))
 """Line styles of policies of the same agent."""
 _MOST_COLUMNS = 4
-_STYLE: Any = STYLE
 
 
 def plot_robustness(table: "pd.DataFrame", *, title: str = "") -> "Figure":
@@ -43,7 +42,7 @@ def plot_robustness(table: "pd.DataFrame", *, title: str = "") -> "Figure":
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         stresses = list(dict.fromkeys(table["stress"]))
         rows = math.ceil(len(stresses) / _MOST_COLUMNS)
         columns = math.ceil(len(stresses) / rows)

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 from rtd3jax.registries import AGENTS
 
-OTHER_COLOUR = "#56B4E9"
+OTHER_COLOUR = "#A6761D"
 """Colour of an agent that defines no colour, or is not registered."""
 
 

@@ -16,7 +16,6 @@ import numpy as np
 
 from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
-from rtd3jax.policies.trained import FORMAT
 from rtd3jax.study.contents import (
     Contents,
     additions_text,
@@ -38,19 +37,15 @@ from rtd3jax.training.checkpoint import checkpoint_steps, why_not_longer
 from rtd3jax.training.lanes import Job
 
 CONFIG = "config.json"
+CONFIG_FORMAT = 2
+"""Format of the configuration. Agents of format 1 read actions in the environment's units."""
 _PATIENCE, _PATIENCE_SECONDS = 10, 0.1
 """How often, and for how many seconds, a shard waits for another that extends the study."""
 PACKAGES = ("rtd3jax", "jax", "jaxlib", "flax", "optax", "gymnax", "numpy")
 
 
 class RunDirectory:
-    """The directory of one sweep.
-
-    An existing study is continued, and seeds, cells and steps are added to it.
-
-    Raises:
-        UserError: when an existing lane would change, or the directory cannot be written.
-    """
+    """The directory of one sweep, in which nothing is written before `prepare`."""
 
     def __init__(
         self,
@@ -58,21 +53,30 @@ class RunDirectory:
         cells: Sequence[Cell],
         seeds: Sequence[int],
         episodes: int,
-        *,
-        prepare: bool = True,
     ):
         self.path = user_path(path)
         self.lanes = LaneFiles(self.path)
         self._made: Plants | None = None
         self._asked = self.contents = Contents(tuple(cells), tuple(seeds), episodes)
-        if prepare:
-            self.prepare()
+
+    @classmethod
+    def create(
+        cls, path: str | Path, cells: Sequence[Cell], seeds: Sequence[int], episodes: int
+    ) -> "RunDirectory":
+        """Write a new study, or add seeds, cells and steps to the existing study in ``path``.
+
+        Raises:
+            UserError: when an existing lane would change, or the directory cannot be written.
+        """
+        directory = cls(path, cells, seeds, episodes)
+        directory.prepare()
+        return directory
 
     @classmethod
     def open(cls, path: str | Path) -> "RunDirectory":
         """Open the existing study in ``path``."""
         there = Contents.read(user_path(path) / CONFIG)
-        directory = cls(path, there.cells, there.seeds, there.episodes, prepare=False)
+        directory = cls(path, there.cells, there.seeds, there.episodes)
         directory.contents = there
         return directory
 
@@ -164,7 +168,12 @@ class RunDirectory:
         if not config.exists():
             study = self.contents.to_dict()
             made_with, plants = _made_with(), self._plants()
-            new = {"format": FORMAT, "study": study, "plants": plants, "made_with": made_with}
+            new = {
+                "format": CONFIG_FORMAT,
+                "study": study,
+                "plants": plants,
+                "made_with": made_with,
+            }
             _write_config(config, new)
             return news
         content = read_config(config)
@@ -225,7 +234,7 @@ class RunDirectory:
 
     def _check_format(self, config: Path) -> None:
         """Raise UserError for a run of version 0.1, whose agents read actions in other units."""
-        if read_config(config).get("format", 1) == FORMAT or self.has_ended():
+        if read_config(config).get("format", 1) != 1 or self.has_ended():
             return
         for cell in self.cells:
             env = cell.make_env()

@@ -9,7 +9,6 @@ study.run()
 study.tables()["episodes"].groupby("algorithm")["return"].mean()
 """
 
-import contextlib
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -20,16 +19,15 @@ from rtd3jax.errors import UserError
 from rtd3jax.evaluation.rollout import check_counts
 from rtd3jax.policies.trained import Policy
 from rtd3jax.study.ceilings import ceilings_of
-from rtd3jax.study.execute import Work, train_here
+from rtd3jax.study.execute import Work
 from rtd3jax.study.figures import final_returns, learning_curves
-from rtd3jax.study.finish import finish
-from rtd3jax.study.lock import writer
-from rtd3jax.study.loggers import check_loggers, open_loggers
+from rtd3jax.study.loggers import check_loggers
 from rtd3jax.study.memory_plan import lanes_at_once, usable_memory
 from rtd3jax.study.plan import Cell
-from rtd3jax.study.references import references_of
 from rtd3jax.study.report.page import write_page
+from rtd3jax.study.run import run_study
 from rtd3jax.study.rundir import RunDirectory, holds_study
+from rtd3jax.study.starts import add_starts
 from rtd3jax.study.status import ledger
 from rtd3jax.study.tables import current_tables
 from rtd3jax.system.files import user_path
@@ -62,11 +60,12 @@ class Study:
     ) -> None:
         check_counts(final_episodes, 0, "final_episodes")
         directory = RunDirectory(
-            user_path(out), _distinct(cells), check_seeds(seeds), int(final_episodes), prepare=False
+            user_path(out), _distinct(cells), check_seeds(seeds), int(final_episodes)
         )
         directory.plan()
         if not holds_study(directory.path):  # opening a study does not extend it
-            directory.jobs(check_strategy(None))  # raises UserError before any file is written
+            # Raises UserError before any file is written.
+            add_starts(directory, directory.jobs(check_strategy(None)), write=False)
             directory.prepare()
         self._directory = directory
 
@@ -103,26 +102,17 @@ class Study:
         directory, strategy = self._directory, check_strategy(strategy)
         check_loggers(log)
         directory.plan()
-        jobs = directory.jobs(strategy)  # raises UserError before any file is written
+        jobs = directory.jobs(strategy)
+        add_starts(directory, jobs, write=False)
+        at_once = lanes_at_once(jobs, strategy, len(workers()), usable_memory())
+        interval = (checkpoint_seconds, None)
+        work = Work(strategy, at_once, interval, quiet=quiet, page=page, keep=keep_checkpoints)
+        # So far, a UserError has left the directory as it was.
         if news := directory.prepare():
             print(news)
-        complaints: list[str] = []
-        with contextlib.ExitStack() as held:
-            held.enter_context(writer(directory.path, None))
-            if directory.refresh():  # another process has changed the study in the meantime
-                jobs = directory.jobs(strategy)
-            at_once = lanes_at_once(jobs, strategy, len(workers()), usable_memory())
-            interval = (checkpoint_seconds, None)
-            work = Work(strategy, at_once, interval, quiet=quiet, page=page, keep=keep_checkpoints)
-            references = references_of(directory.cells)
-            ended = False
-            try:
-                with open_loggers(log, directory) as logger:
-                    train_here(directory, jobs, work, complaints, references, logger)
-                ended = True
-            finally:
-                held.close()  # else the page shows lanes that were interrupted as running
-                finish(directory, references, page=page, interrupted=not ended)
+        complaints, interrupt = run_study(directory, jobs, work, log=log)
+        if interrupt is not None:
+            raise interrupt
         return complaints
 
     def status(self) -> pd.DataFrame:

@@ -14,7 +14,7 @@ def make_run(out, grid):
     """A finished run of untrained agents with invented curves: nothing is compiled for it."""
     settings = {"total_steps": 60, "hidden_size": 8, "eval_every": 20, "batch_size": 8}
     settings |= {"learning_starts": 10}
-    directory = RunDirectory(out, make_cells([grid], settings), [0, 1], 2)
+    directory = RunDirectory.create(out, make_cells([grid], settings), [0, 1], 2)
     chance = np.random.default_rng(0)
     for cell in directory.cells:
         for seed in directory.seeds:

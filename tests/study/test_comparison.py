@@ -62,7 +62,7 @@ def make_run(out, grid, better, seeds=(0, 1, 2), **settings):
     """A finished run of untrained agents; seed s has return s + ``better``, truly 10 more."""
     fields = {"total_steps": 60, "hidden_size": 8, "eval_every": 60, "batch_size": 8}
     fields |= {"learning_starts": 10, **settings}
-    directory = RunDirectory(out, make_cells([grid], fields), list(seeds), 2)
+    directory = RunDirectory.create(out, make_cells([grid], fields), list(seeds), 2)
     for cell in directory.cells:
         policy = random_policy(cell.config.algorithm, cell.make_env())
         for seed in directory.seeds:
@@ -132,7 +132,7 @@ def test_what_cannot_be_compared_is_one_line(runs, chosen, match, capsys):
 
 def test_a_run_without_results_and_no_run_are_one_line(runs, tmp_path, capsys):
     cells = make_cells([Grid("rover", ("ar1-slip",), ("td3",), (1,))], {})
-    RunDirectory(tmp_path / "planned", cells, [0], 2)
+    RunDirectory.create(tmp_path / "planned", cells, [0], 2)
     for other, match in (("planned", "has no results yet"), ("nothing", "nothing")):
         assert command.main([runs["before"], str(tmp_path / other)]) == 2
         error = capsys.readouterr().err

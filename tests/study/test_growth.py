@@ -143,8 +143,8 @@ def test_a_dry_run_says_what_would_be_added_and_writes_nothing(grown, capsys, mo
     assert json.loads((out / "config.json").read_text()) == kept["longer"][1]
 
 
-def _directory(path, *cells, seeds=(0,), **options):
-    return RunDirectory(path, cells or [cell()], seeds, 2, **options)
+def _directory(path, *cells, seeds=(0,)):
+    return RunDirectory.create(path, cells or [cell()], seeds, 2)
 
 
 def _finish(directory, one, failure=None, checkpoint=None):
@@ -182,9 +182,9 @@ def test_more_steps_that_cannot_go_on_are_refused_with_what_to_do(tmp_path):
 
 
 def test_a_default_that_is_given_adds_nothing(tmp_path):
-    there = RunDirectory(tmp_path / "run", [cell()], [0], 2)
+    there = RunDirectory.create(tmp_path / "run", [cell()], [0], 2)
     asked = cell(actor_starts=SETTINGS["learning_starts"])
-    again = RunDirectory(tmp_path / "run", [asked], [0], 2, prepare=False)
+    again = RunDirectory(tmp_path / "run", [asked], [0], 2)
     assert again.plan() == "" and again.cells == there.cells == [cell()]
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from rtd3jax.cli import sweep
 from rtd3jax.errors import UserError
-from rtd3jax.study import loggers
+from rtd3jax.study import loggers, run
 from rtd3jax.study.loggers import METRIC, check_loggers, open_loggers
 from rtd3jax.study.plan import Grid, make_cells
 from rtd3jax.study.rundir import RunDirectory
@@ -18,7 +18,7 @@ ROWS = [(20, -3.5), (40, None), (60, -1.25)]
 @pytest.fixture
 def directory(tmp_path):
     cells = make_cells([Grid("rover", ("ar1-slip",), ("td3", "h-td3"), (1,))], {})
-    return RunDirectory(tmp_path / "run", cells, [0, 1], 2)
+    return RunDirectory.create(tmp_path / "run", cells, [0, 1], 2)
 
 
 def feed(name, directory, rows=ROWS):
@@ -57,12 +57,12 @@ def test_mlflow_goes_on_in_the_run_of_a_lane(directory):
     client = MlflowClient(f"sqlite:///{directory.path / 'mlflow.db'}")
     runs = client.search_runs([client.get_experiment_by_name("run").experiment_id])
     assert len(runs) == 4
-    for run in runs:
-        points = client.get_metric_history(run.info.run_id, METRIC)
+    for one in runs:
+        points = client.get_metric_history(one.info.run_id, METRIC)
         assert [(p.step, p.value) for p in points] == [(20, -3.5), (60, -1.25)]
-        losses = client.get_metric_history(run.info.run_id, LOSS)
+        losses = client.get_metric_history(one.info.run_id, LOSS)
         assert [(p.step, p.value) for p in losses] == [(20, 7.0), (60, 2.5)]
-        assert run.data.params["env"] == "rover"
+        assert one.data.params["env"] == "rover"
 
 
 def test_wandb_offline(directory, monkeypatch):
@@ -92,7 +92,7 @@ def test_a_sweep_feeds_them(tmp_path, monkeypatch):
             rows.append("closed")
 
     monkeypatch.setitem(loggers.LOGGERS, "tensorboard", ("json", Fake))
-    monkeypatch.setattr(sweep, "references_of", lambda cells: [])
+    monkeypatch.setattr(run, "references_of", lambda cells: [])
     study = "--env rover --disturbances ar1-slip --algorithms td3 --seeds 2 --total-steps 60 "
     study += "--hidden-size 4 --batch-size 4 --learning-starts 10 --eval-every 30 "
     study += "--eval-episodes 1 --final-episodes 2 --quiet --no-report"
@@ -169,27 +169,30 @@ def test_tensorboard_on_a_full_disk_neither_stops_nor_hangs(directory, monkeypat
 
 
 class FakeWandb:
-    """Keeps what ``init`` was given."""
+    """Keeps what ``init`` and ``log`` were given."""
 
     class api:  # noqa: N801
         api_key = None
 
+    def __init__(self):
+        self.begun, self.rows, self.axes = [], [], {}
+
     def init(self, **arguments):
-        self.arguments = arguments
+        self.begun.append(arguments)
         return self
 
     def define_metric(self, name, step_metric):
-        pass
+        self.axes[name] = step_metric
 
     def log(self, values):
-        pass
+        self.rows.append(values)
 
     def finish(self):
         pass
 
 
 def test_wandb_is_offline_unless_asked(directory, monkeypatch):
-    fake, row = FakeWandb(), {"step": 1, "return": 1.0, "metrics": {}}
+    fake, row = FakeWandb(), {"step": 1, "return": 1.5, "metrics": {"critic_loss": 0.5}}
     monkeypatch.setattr(loggers.importlib, "import_module", lambda name: fake)
     for mode in (None, "disabled"):
         monkeypatch.delenv("WANDB_MODE", raising=False)
@@ -197,7 +200,10 @@ def test_wandb_is_offline_unless_asked(directory, monkeypatch):
             monkeypatch.setenv("WANDB_MODE", mode)
         with open_loggers(["wandb"], directory) as logger:
             logger.log(directory.cells[0], 0, row)
-        assert fake.arguments["mode"] == (mode or "offline")
+        assert fake.begun[-1]["mode"] == (mode or "offline")
+        assert fake.rows[-1] == {METRIC: 1.5, LOSS: 0.5, fake.axes[METRIC]: 1}
+    first, again = fake.begun
+    assert first["id"] == again["id"] and again["resume"] == "allow"  # one curve, when resumed
     monkeypatch.setenv("WANDB_MODE", "online")
     with pytest.raises(UserError, match="run wandb login"), open_loggers(["wandb"], directory):
         pass

@@ -51,7 +51,7 @@ def study(path, drain, disturbances=("none",), noise=0.1):
     rtd.register("tank-of-a-study", Tank(drain), processes, replace=True)
     config = rtd.Config("td3", total_steps=200)
     cells = [Cell("tank-of-a-study", name, config) for name in disturbances]
-    return RunDirectory(path, cells, [0], 2)
+    return RunDirectory.create(path, cells, [0], 2)
 
 
 def test_a_changed_plant_of_the_same_name_is_refused_with_the_difference(tmp_path):

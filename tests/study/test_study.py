@@ -6,7 +6,7 @@ import pytest
 import rtd3jax as rtd
 from rtd3jax import sweep
 from rtd3jax.cli import sweep as sweep_module
-from rtd3jax.study import study as study_module
+from rtd3jax.study import run
 from rtd3jax.study.lock import is_held
 
 TINY = dict(
@@ -71,14 +71,17 @@ def test_cells_that_tables_could_not_tell_apart_are_refused(tmp_path):
     [
         (("rovr", "ar1-slip"), {}, "unknown environment 'rovr'"),
         (("rover", "ar2-slip"), {}, "unknown disturbance 'ar2-slip'"),
+        (("rover", "ar1-slip", rtd.Config("td3", start="nowhere")), {}, "nowhere cannot be read"),
         (("rover", "ar1-slip"), {"final_episodes": 2.5}, "final_episodes must be an integer"),
         (("rover", "ar1-slip"), {"final_episodes": 0}, "final_episodes must be an integer"),
         (("rover", "ar1-slip"), {"final_episodes": "20"}, "final_episodes must be an integer"),
     ],
 )
 def test_a_study_that_cannot_run_writes_nothing(cell, options, message, tmp_path):
+    env, disturbance, *config = cell
+    cells = [rtd.Cell(env, disturbance, *config or [rtd.Config("td3")])]
     with pytest.raises(rtd.UserError, match=message):
-        rtd.Study([rtd.Cell(*cell, rtd.Config("td3"))], out=tmp_path / "study", **options)
+        rtd.Study(cells, out=tmp_path / "study", **options)
     assert not list(tmp_path.iterdir())
 
 
@@ -115,9 +118,8 @@ def test_after_an_interrupt_the_page_does_not_say_that_lanes_are_running(
         held.append(is_held(directory.path))
         (directory.path / "summary.md").write_text("")
 
-    module = {"study": study_module, "sweep": sweep_module}[how]
-    monkeypatch.setattr(module, "train_here", interrupt)
-    monkeypatch.setattr(module, "finish", finish)
+    monkeypatch.setattr(run if how == "study" else sweep_module, "train_here", interrupt)
+    monkeypatch.setattr(run, "finish", finish)
     if how == "study":
         with pytest.raises(KeyboardInterrupt):
             rtd.Study(_cells(), seeds=[0], out=tmp_path / "run").run(quiet=True)

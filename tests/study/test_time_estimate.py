@@ -1,5 +1,9 @@
 """Tests the time estimate: some programs are measured, the others are interpolated."""
 
+import threading
+from types import SimpleNamespace
+
+import jax
 import numpy as np
 import pytest
 
@@ -44,6 +48,25 @@ def test_a_lane_is_timed_without_its_random_steps(monkeypatch):
         time_estimate.group_seconds([untrained]),
     )
     assert (with_updates, without) == (800 + 2 * 5, 2 * 5)
+
+
+def test_the_seconds_of_a_step_leave_out_the_first_call_and_the_evaluations(monkeypatch):
+    now, calls = [0.0], []
+
+    def advance(lane, state, start, stop):
+        start, stop = int(start), int(stop)
+        ends = stop // 100 - start // 100  # evaluations
+        now[0] += 0.01 * (stop - start) + 3.0 * ends + (0.0 if calls else 60.0)
+        calls.append((start, stop))
+        return state
+
+    monkeypatch.setattr(time_estimate, "compiled", lambda *_: (lambda lane: 0, advance))
+    monkeypatch.setattr(time_estimate, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    together = threading.Barrier(1)
+    jobs = _jobs("td3", eval_every=100)[:1]
+    step, evaluation = time_estimate._timed(jobs, jax.devices()[0], together)
+    assert (step, evaluation) == (pytest.approx(0.01), pytest.approx(3.0))
+    assert calls[-1] == (99, 100)
 
 
 def test_what_fails_while_it_is_timed_is_raised(monkeypatch):

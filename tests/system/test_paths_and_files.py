@@ -70,7 +70,7 @@ def test_a_home_directory_is_found_in_every_path(tmp_path, monkeypatch):
     assert read_arrays("~/a/g") == ({}, {}) and (tmp_path / "a" / "f").read_bytes() == b"1"
     given = sweep_options.parser("").parse_args(["--env", "rover", "--out=~/x"])
     assert sweep_options.out(given) == tmp_path / "x"
-    RunDirectory("~/r", [], [0], 1)
+    RunDirectory.create("~/r", [], [0], 1)
     assert RunDirectory.open(pathlib.Path("~/r")).path == tmp_path / "r"
     assert not (tmp_path / "~").exists()
     with pytest.raises(rtd.UserError, match=f"{tmp_path}/absent cannot be read"):

@@ -226,7 +226,7 @@ def test_side_by_side_lanes_whose_checkpoints_are_of_no_use_begin_from_the_start
     file = tmp_path / "p.safetensors"
     run.policy(0).save(file)
     cell = rtd.Cell("rover", "sine-slip", _config(start=str(file)))
-    directory = RunDirectory(tmp_path / "run", [cell], [0, 1], 2)
+    directory = RunDirectory.create(tmp_path / "run", [cell], [0, 1], 2)
     checkpoints = checkpoints_of(directory, (None, None))
     jobs = directory.jobs("vmap")
     program = jobs[0].program
@@ -305,7 +305,7 @@ def test_what_fresh_moves_away_is_no_start(tmp_path, capsys):
 
     config = rtd.Config(**{**SMALL, "start": "elsewhere"})
     own, other = (
-        RunDirectory(tmp_path / name, [rtd.Cell("rover", "ar1-slip", config)], [0], 2)
+        RunDirectory.create(tmp_path / name, [rtd.Cell("rover", "ar1-slip", config)], [0], 2)
         for name in ("own", "other")
     )
     (tmp_path / "link").symlink_to(own.path)

@@ -199,16 +199,14 @@ def entry_angle(
     wheel: Wheel,
     load: jax.Array,
     slip: jax.Array,
-    rolling: float | jax.Array = 1.0,
-    iterations: int = 12,
 ) -> jax.Array:
     """The entry angle at which the soil carries ``load`` N: the dynamic sinkage."""
 
     def closer(_: int, entry: jax.Array) -> jax.Array:
-        vertical = contact_forces(soil, wheel, entry, slip, rolling).vertical
+        vertical = contact_forces(soil, wheel, entry, slip).vertical
         return deeper(soil, entry, vertical, load)
 
-    return jax.lax.fori_loop(0, iterations, closer, static_entry_angle(soil, wheel, load))
+    return jax.lax.fori_loop(0, 12, closer, static_entry_angle(soil, wheel, load))
 
 
 def unit_nodes(count: int) -> tuple[list[float], list[float]]:
