@@ -281,7 +281,7 @@ CLAIMS: tuple[tuple[int, str, Callable[[Results], list[Effect]]], ...] = (
     (10, "`h-td3` has the shortest iteration, least sensitive to the window", iteration_time),
     (11, "agents trained on `random-sine` carry over, except to `noise`", carries_over),
     (12, "rover on AR(1) slip: every agent with an LSTM beats `td3`", agents_beat_td3),
-    (13, "training on sine slip transfers better than training without slip", sine_over_none),
+    (13, "training on sine slip transfers far better than training without slip", sine_over_none),
     (14, "`lstm-td3-1ha1hc` transfers best from sine to AR(1) slip", best_transfer),
     (15, "high variance hurts most, fast slip is the easiest", slip_variants),
 )

@@ -236,6 +236,7 @@ def report(options: argparse.Namespace, episodes: int, began: float) -> int:
     lanes = rows[rows["trained_on"] == rows["tested_on"]].drop(columns="trained_on")
     lanes = lanes.rename(columns={"tested_on": "disturbance", "true_return": "mean"})
     lanes = with_others(lanes, options.out / "pendulum.parquet", "disturbance")
+    lanes = lanes.drop(columns="return", errors="ignore")  # which an earlier version kept
     lanes["episodes"] = lanes["episodes"].fillna(EARLIER_EPISODES).astype(int)
     filtered = filter_returns(options.out)
     text = table(lanes, "disturbance", ALL_DISTURBANCES, filtered)

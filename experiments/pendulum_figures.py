@@ -11,7 +11,8 @@ following figures as PNG and SVG, if the tables have rows for them:
 * action_history: `lstm-td3` with and without past actions, a panel per length;
 * generalisation: bars of the agents trained on `random-sine`, a panel per condition.
 
-Only rows with the current settings are drawn. Bands and bars are one standard deviation over seeds.
+A solid grey line is the fully observed optimum, and a dotted one uniform random actions. Only rows
+with the current settings are drawn. Bands and bars are one standard deviation over seeds.
 """
 
 import argparse
@@ -21,6 +22,7 @@ import sys
 import matplotlib
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import rtd3jax as rtd
@@ -33,6 +35,7 @@ from writing import RESULTS  # noqa: E402
 
 DISTURBANCES = (*presets.PENDULUM_DISTURBANCES, *presets.ACTION_HISTORY_DISTURBANCES)
 GREY = "#777777"
+NORMALISED = "normalised return\n(1: the fully observed optimum, 0: uniform random actions)"
 LINES = {0: "#000000", 1: "#56B4E9", 3: "#009E73", 6: "#E69F00", 10: "#D55E00", 20: "#CC79A7"}
 """A colour for each history length; 0 is for agents without a window."""
 
@@ -96,7 +99,7 @@ def learning_curves(curves: pd.DataFrame) -> Figure:
                 low, high = steps["mean"] - steps["std"], steps["mean"] + steps["std"]
                 axes.fill_between(x, low, high, color=LINES.get(length, GREY), alpha=0.15, lw=0)
                 shown[length] = line
-            axes.axhline(1.0, color=GREY, lw=0.8)
+            _draw_scale(axes)
             axes.set_ylim(-0.5, 1.05)
             axes.grid(color="#E4E4E4", lw=0.6)
             middle = {"ha": "center", "transform": axes.transAxes}
@@ -112,7 +115,7 @@ def learning_curves(curves: pd.DataFrame) -> Figure:
                 axes.set_title(agent, fontsize=9)
         row[0].set_ylabel(name, fontsize=9)
     figure.supxlabel("thousand steps", fontsize=9)
-    figure.supylabel("normalised return", fontsize=9)
+    figure.supylabel(NORMALISED, fontsize=9)
     _legend_of_lengths(figure, shown)
     return figure
 
@@ -143,14 +146,13 @@ def final_returns(lanes: pd.DataFrame, filtered: dict[str, float]) -> Figure:
             for index, agent in enumerate(agents):
                 seeds = own[own["algorithm"] == agent]["normalised"]
                 axes.plot([index] * len(seeds), seeds, ".", ms=3, color=colour, alpha=0.4)
-        axes.axhline(1.0, color=GREY, lw=0.8)
+        _draw_scale(axes)
         if name in filtered:
             axes.axhline(filtered[name], color=GREY, lw=1.0, ls="--")
         axes.set_xticks(range(len(agents)), agents, rotation=60, ha="right")
         axes.set_title(name, fontsize=10)
         axes.grid(axis="y", color="#E4E4E4", lw=0.6)
-    for axes in panels[:, 0]:
-        axes.set_ylabel("normalised return")
+    figure.supylabel(NORMALISED, fontsize=9)
     _legend_of_lengths(figure, shown)
     return figure
 
@@ -169,7 +171,7 @@ def action_history(lanes: pd.DataFrame) -> Figure | None:
         here = own[own["history_length"] == length]
         _bars(axes, here, "disturbance", names, list(pair))
         axes.set_title(f"l = {length}", fontsize=10)
-    panels[0].set_ylabel("normalised return")
+    figure.supylabel(NORMALISED, fontsize=9)
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, fontsize=8, ncols=2, loc="outside upper center")
     return figure
@@ -186,10 +188,17 @@ def generalisation(moved: pd.DataFrame) -> Figure | None:
     for axes, length in zip(panels, lengths, strict=True):
         here = moved[moved["history_length"].isin([0, length])]
         _bars(axes, here, "tested_on", conditions, agents_in(moved))
-        axes.set_ylabel(f"l = {length}\nnormalised return", fontsize=9)
+        axes.set_ylabel(f"l = {length}", fontsize=9)
+    figure.supylabel(NORMALISED, fontsize=9)
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, fontsize=7, ncols=3, loc="outside upper center")
     return figure
+
+
+def _draw_scale(axes: Axes) -> None:
+    """Draw the optimum as a solid line, and uniform random actions as a dotted one."""
+    axes.axhline(1.0, color=GREY, lw=0.8)
+    axes.axhline(0.0, color=GREY, lw=0.8, ls=":")
 
 
 def _legend_of_lengths(figure: Figure, shown: dict[int, object]) -> None:
@@ -215,7 +224,7 @@ def _bars(
         y = np.array([means[name] for name in names if name in means])
         error = np.array([spread[name] for name in names if name in means])
         axes.bar(x, y, width, yerr=error, color=colour_of(agent), label=agent, error_kw={"lw": 0.8})
-    axes.axhline(1.0, color=GREY, lw=0.8)
+    _draw_scale(axes)
     axes.set_ylim(min(0.0, axes.get_ylim()[0]), 1.08)
     labels = [name.split(":")[0] + (" σ = 1" if "sigma=1" in name else "") for name in names]
     axes.set_xticks(range(len(names)), labels, rotation=30, ha="right", fontsize=8)

@@ -47,7 +47,8 @@ def _lines() -> Iterator[str]:
     for env, disturbances in LISTED.items():
         yield from _listed(env, (name for name in disturbances if name not in FAULTS))
     yield from _listed("any", FAULTS)
-    yield "  rtd3jax.make also makes gymnax's environments; rtd3jax.register adds others."
+    yield "  rtd3jax.make also makes gymnax's ids, and Gymnasium's as gymnasium:ID;"
+    yield "  rtd3jax.register adds others."
     yield ""
     yield from _listed("Agents", AGENTS, indent="")
     yield from _listed("Memories", MEMORIES, indent="")

@@ -365,7 +365,13 @@ class Config:
         return self.history_length
 
     @property
-    def runs_on(self) -> bool:
+    def acting_mode(self) -> Acting:
+        """How the agent acts: with a ``window``, or with a running ``carry``."""
+        assert self.acting is not None  # resolved when it was made
+        return self.acting
+
+    @property
+    def has_running_carry(self) -> bool:
         """Whether the agent acts with a carry that it updates from the start of the episode."""
         return self.acting == "carry"
 

@@ -23,6 +23,12 @@ def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
         )
 
 
+def typed_reason(error: BaseException) -> str:
+    """`short_reason` after the error's type, for errors of code of others."""
+    reason, name = short_reason(error), type(error).__name__
+    return reason if reason == name else f"{name}: {reason}"
+
+
 def short_reason(error: BaseException) -> str:
     """The line of an error's message that says most, or the error's type if there is none.
 

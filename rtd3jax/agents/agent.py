@@ -55,7 +55,7 @@ class Agent:
     Attributes:
         variant: the definition of the agent.
         networks: actor and critic for updates, in the configuration's precision.
-        acting: the actor in float32, for acting and for policies.
+        acting_actor: the actor in float32, for acting and for policies.
         learner: the learner that trains the networks.
         config: the configuration.
         observation_size: O.
@@ -65,7 +65,7 @@ class Agent:
 
     variant: Variant
     networks: Networks
-    acting: Network
+    acting_actor: Network
     learner: Learner
     config: Config
     observation_size: int
@@ -80,7 +80,7 @@ class Agent:
     @property
     def has_running_carry(self) -> bool:
         """Whether the agent acts with a carry from the start of the episode, not with a window."""
-        return self.config.runs_on
+        return self.config.has_running_carry
 
     @property
     def acting_tokens(self) -> int:
@@ -104,7 +104,7 @@ class Agent:
 
     def empty_replay(self) -> Replay:
         """An empty ring buffer for the agent's transitions."""
-        carry = self.acting.zero_carry(1) if self.stores_carry else None
+        carry = self.acting_actor.zero_carry(1) if self.stores_carry else None
         return empty_replay(
             self.config.capacity,
             self.observation_size,
@@ -115,8 +115,12 @@ class Agent:
         )
 
     def zero_carry(self) -> Carry | None:
-        """The running carries, leaves [K, ...], at the start of episodes; None with windows."""
-        return self.acting.zero_carry(self.config.environments) if self.has_running_carry else None
+        """The running carries, leaves [E, ...], at the start of episodes; None with windows."""
+        return (
+            self.acting_actor.zero_carry(self.config.environments)
+            if self.has_running_carry
+            else None
+        )
 
     def no_statistics(self) -> Statistics | None:
         """Statistics of zero observations; None without normalisation of observations."""
@@ -139,9 +143,9 @@ class Agent:
         """
         carry = running
         if carry is None and self.variant.critic_reads_carries:
-            carry = carry_before(self.acting, actor, window)
+            carry = carry_before(self.acting_actor, actor, window)
         kept = carry if self.stores_carry else None
-        return act(self.acting, actor, window, carry), kept
+        return act(self.acting_actor, actor, window, carry), kept
 
     def carry_after(
         self, actor: Params, window: Window, action: jax.Array, running: Carry | None
@@ -149,7 +153,7 @@ class Agent:
         """The running carry after a step with ``action`` [B, A]; None with windows."""
         if running is None:
             return None
-        return advance(self.acting, actor, window, action, running)
+        return advance(self.acting_actor, actor, window, action, running)
 
     def final_carry(
         self,
@@ -167,7 +171,7 @@ class Agent:
         if running is not None:
             return running
         after = next_window(window, action, final_observation, history_length)
-        return carry_before(self.acting, actor, after)
+        return carry_before(self.acting_actor, actor, after)
 
     def sample(
         self,
@@ -197,7 +201,7 @@ class Agent:
                 config.segment_steps,
                 config.burn_in_gradient,
                 critic_reads_carries=self.variant.critic_reads_carries,
-                actor_goes_on=config.runs_on,
+                actor_reads_carries=config.has_running_carry,
             )
         return sample(*rows)
 
@@ -243,7 +247,7 @@ def make_agent(config: Config, interface: Sizes) -> Agent:
     return Agent(
         variant=variant,
         networks=Networks(actor, critic),
-        acting=make_part(variant, "actor", config.memory, *sizes),
+        acting_actor=make_part(variant, "actor", config.memory, *sizes),
         learner=LEARNERS[variant.learner](config),
         config=config,
         observation_size=interface.observation_size,

@@ -1,7 +1,7 @@
 """Histories: the past tokens of an agent, read from a ring buffer (paper, Section 5.1).
 
-A lane may have K environments that step together. Step s of environment e has the number
-``s K + e``, so the number of the previous step is smaller by K.
+A lane may have E environments that step together. Step s of environment e has the number
+``s E + e``, so the number of the previous step is smaller by E.
 
 The same function, `window_at`, is used for acting, replay, evaluation and deployment. Its
 invariant: the existing tokens are the last tokens of the window. A token does not exist if it is
@@ -148,7 +148,7 @@ def put_row(ring: jax.Array, slot: jax.Array, row: jax.Array) -> jax.Array:
 
 
 def put_rows(ring: jax.Array, slot: jax.Array, rows: jax.Array) -> jax.Array:
-    """``ring`` [C, ...] with ``rows`` [K, ...] from ``slot`` on; written in place under jit."""
+    """``ring`` [C, ...] with ``rows`` [E, ...] from ``slot`` on; written in place under jit."""
     return jax.lax.dynamic_update_slice_in_dim(ring, rows.astype(ring.dtype), slot, axis=0)
 
 
@@ -180,7 +180,7 @@ def window_at(
         history_length: l <= L, past tokens that may be read.
         observation: [B, O], the observation of the step.
         previous_action: [B, A], the action of the previous step.
-        environments: K, number of environments that step together.
+        environments: E, number of environments that step together.
     """
     capacity = ring.action.shape[0]
     offset = environments * jnp.arange(window_tokens, 0, -1, dtype=jnp.int32)
@@ -217,7 +217,7 @@ def segment_at(
         length: m.
         history_length: l <= L, tokens of the burn-in that may be read.
         burn_in_gradient: see `Segment`.
-        environments: K, number of environments that step together.
+        environments: E, number of environments that step together.
     """
     capacity = episode_steps.shape[0]
     offset = jnp.arange(-window_tokens, length, dtype=jnp.int32)

@@ -1,4 +1,4 @@
-"""Noise on actions, for exploration and for target policy smoothing."""
+"""Noise on actions, for exploration and for the actor's objective (``actor_noise``)."""
 
 import jax
 import jax.numpy as jnp

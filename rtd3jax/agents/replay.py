@@ -1,10 +1,10 @@
 """A lane's replay: a ring buffer of transitions, from which batches of windows are read.
 
 Every environment step writes one row, so the lane's step determines the number of the row, and the
-ring needs no counter: of K environments, environment e writes row ``s K + e`` at the lane's step s.
+ring needs no counter: of E environments, environment e writes row ``s E + e`` at the lane's step s.
 If the critics of an agent (h-td3) or its segments start from the behaviour actor's carries, the
 ring also stores these carries. This module ensures the order of reads and writes that this needs.
-Shapes: ``C`` capacity, ``B`` batch, ``H`` width.
+Shapes: ``C`` capacity, ``B`` batch, ``H`` width, ``E`` environments.
 """
 
 import dataclasses
@@ -71,11 +71,11 @@ class Replay:
 
     Attributes:
         transitions: leaves [C, ...].
-        carries: None, or leaves [C + K, ...]: slot n % (C + K) holds the behaviour actor's carry
-            before the token of step n. It is the carry of row n, and the next carry of row n - K.
+        carries: None, or leaves [C + E, ...]: slot n % (C + E) holds the behaviour actor's carry
+            before the token of step n. It is the carry of row n, and the next carry of row n - E.
             The carry of an episode's first step is zero and needs no slot, so the slot holds the
             carry before the final observation of the previous episode.
-        environments: K; it divides C.
+        environments: E; it divides C.
     """
 
     transitions: Transition
@@ -142,14 +142,14 @@ def present_window(
     window_tokens: int,
     history_length: jax.Array | int,
 ) -> Window:
-    """The K windows of the lane's step ``step`` (int32 []), which is not in the ring yet.
+    """The E windows of the lane's step ``step`` (int32 []), which is not in the ring yet.
 
     Args:
         replay: the ring, with all earlier steps.
         step: the number of the step.
-        episode_step: int32 [K], number of earlier steps of the same episode.
-        observation: [K, O], the observations of the step.
-        previous_action: [K, A], the previous actions.
+        episode_step: int32 [E], number of earlier steps of the same episode.
+        observation: [E, O], the observations of the step.
+        previous_action: [E, A], the previous actions.
         window_tokens: L, past tokens in the window's arrays.
         history_length: l <= L, past tokens that may be read.
     """
@@ -168,7 +168,7 @@ def present_window(
 
 
 def put_transitions(replay: Replay, first: jax.Array, rows: Transition) -> Replay:
-    """The ring after writing ``rows`` of K environments (leaves [K, ...]) from ``first`` on."""
+    """The ring after writing ``rows`` of E environments (leaves [E, ...]) from ``first`` on."""
     kept = replay.transitions
     slot = first % kept.reward.shape[0]
     written = jax.tree.map(lambda ring, new: put_rows(ring, slot, new), kept, rows)
@@ -176,7 +176,7 @@ def put_transitions(replay: Replay, first: jax.Array, rows: Transition) -> Repla
 
 
 def put_carries(replay: Replay, first: jax.Array, rows: Carry) -> Replay:
-    """The ring after writing the carries (leaves [K, ...]) of the steps from ``first`` on."""
+    """The ring after writing the carries (leaves [E, ...]) of the steps from ``first`` on."""
     slot = _carry_slot(replay.carries, first)
     carries = jax.tree.map(lambda kept, new: put_rows(kept, slot, new), replay.carries, rows)
     return dataclasses.replace(replay, carries=carries)
@@ -185,7 +185,7 @@ def put_carries(replay: Replay, first: jax.Array, rows: Carry) -> Replay:
 def keep_acting_carry(
     replay: Replay, step: jax.Array, episode_step: jax.Array, carry: Carry | None
 ) -> Replay:
-    """Store the carries (leaves [K, ...]) with which step ``step`` acts, before its updates.
+    """Store the carries (leaves [E, ...]) with which step ``step`` acts, before its updates.
 
     The carry of an episode's first step is not stored: its slot holds the carry before the final
     observation of the previous episode.
@@ -215,9 +215,9 @@ def store(
     Args:
         replay: the ring.
         step: int32 [].
-        rows: the transitions of the K environments, leaves [K, ...].
-        done: bool [K], whether the step ended an episode.
-        final_carry: returns the behaviour actor's carries, leaves [K, ...], before the final
+        rows: the transitions of the E environments, leaves [E, ...].
+        done: bool [E], whether the step ended an episode.
+        final_carry: returns the behaviour actor's carries, leaves [E, ...], before the final
             observations; only called if the ring stores carries.
         never: bool [], false, computed from values that the updates read; see `_after`.
     """
@@ -338,7 +338,7 @@ def sample_segments(
     burn_in_gradient: bool,
     *,
     critic_reads_carries: bool = True,
-    actor_goes_on: bool = False,
+    actor_reads_carries: bool = False,
 ) -> Batch:
     """As `sample`, but B / m segments of m consecutive steps; their first steps are uniform.
 
@@ -353,14 +353,21 @@ def sample_segments(
         burn_in_gradient: whether gradients flow into the burn-in.
         critic_reads_carries: whether the batch holds the ring's carries, if there are any, for the
             critic.
-        actor_goes_on: whether the segments begin with the ring's carries, for the actor.
+        actor_reads_carries: whether the segments begin with the ring's carries, for the actor.
     """
     oldest = jnp.maximum(count - replay.transitions.reward.shape[0], 0)
     last = count - (length - 1) * replay.environments
     first = jax.random.randint(key, (batch_size // length,), oldest, last, jnp.int32)
-    rows = replay, first, count, window_tokens, history_length, length, burn_in_gradient
     return gather_segments(
-        *rows, critic_reads_carries=critic_reads_carries, actor_goes_on=actor_goes_on
+        replay,
+        first,
+        count,
+        window_tokens,
+        history_length,
+        length,
+        burn_in_gradient,
+        critic_reads_carries=critic_reads_carries,
+        actor_reads_carries=actor_reads_carries,
     )
 
 
@@ -374,7 +381,7 @@ def gather_segments(
     burn_in_gradient: bool,
     *,
     critic_reads_carries: bool = True,
-    actor_goes_on: bool = False,
+    actor_reads_carries: bool = False,
 ) -> Batch:
     """The batch of the segments that begin at these numbers (int32 [M]); see `sample_segments`.
 
@@ -399,7 +406,7 @@ def gather_segments(
     carry = next_carry = None
     if critic_reads_carries:
         carry, next_carry = _stored_carries(replay, step_number, kept.episode_step[slot])
-    if actor_goes_on and replay.carries is not None:
+    if actor_reads_carries and replay.carries is not None:
         segment = dataclasses.replace(
             segment, start=_carry_at(replay.carries, first - replay.environments * window_tokens)
         )

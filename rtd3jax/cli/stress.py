@@ -10,8 +10,7 @@ from collections.abc import Sequence
 
 from rtd3jax.cli.common import exit_status, run_parser
 from rtd3jax.study.report.page import NAME, refresh_page
-from rtd3jax.study.report.robustness import FILE
-from rtd3jax.study.robustness import draw_robustness, run_robustness
+from rtd3jax.study.robustness import FILE, draw_robustness, run_robustness
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.system.imports import import_modules
 

@@ -46,7 +46,8 @@ def parser(description: str | None) -> argparse.ArgumentParser:
         "--preset", choices=sorted(PRESETS), help="a study with its settings, ready to run"
     )
     study.add_argument(
-        "--env", help=f"{', '.join(LISTED)}, a registered id, or any id that gymnax makes"
+        "--env",
+        help=f"{', '.join(LISTED)}, a registered id, any id that gymnax makes, or gymnasium:ID",
     )
     add_import(study)
     study.add_argument(

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from rtd3jax.cli.common import exit_status, run_parser
 from rtd3jax.study.report.page import NAME, refresh_page
 from rtd3jax.study.rundir import RunDirectory
-from rtd3jax.study.transfer import transfer
+from rtd3jax.study.transfer import FILE, transfer
 from rtd3jax.system.imports import import_modules
 
 
@@ -30,7 +30,7 @@ def _run(options: argparse.Namespace) -> int:
     lanes = ["env", "algorithm", "history_length", "trained_on"]
     means = rows.pivot_table(index=lanes, columns="tested_on", values="return", sort=False)
     print(means.round(3).to_string())
-    print(f"results: {directory.path / 'transfer.parquet'}, {page}")
+    print(f"results: {directory.path / FILE}, {page}")
     return 0
 
 

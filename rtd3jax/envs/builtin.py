@@ -6,7 +6,8 @@ import rtd3jax.envs.rover_soil.registration  # noqa: F401
 from rtd3jax.envs.registry import disturbances_of
 
 ENVIRONMENTS: tuple[str, ...] = ("pendulum", "rover")
-"""Ids of the paper's environments. `rtd3jax.make` also makes `rover-soil` and every gymnax id."""
+"""Ids of the paper's environments. `rtd3jax.make` also makes `rover-soil`, every gymnax id, and
+Gymnasium's ids after ``gymnasium:``."""
 
 DISTURBANCES: dict[str, tuple[str, ...]] = {env: disturbances_of(env) for env in ENVIRONMENTS}
 """The disturbances of each environment: the paper's (Sections 5.2 and 8.4), then ``FAULTS``.

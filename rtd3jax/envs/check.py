@@ -25,7 +25,7 @@ from rtd3jax.envs.interface import (
     foreign_code,
     survey,
 )
-from rtd3jax.errors import UserError
+from rtd3jax.errors import UserError, typed_reason
 from rtd3jax.protocols import EnvironmentLike
 
 EPISODES = 8
@@ -158,10 +158,9 @@ def _played(
     try:
         record = _episodes(env, params, interface, seed, steps)
     except Exception as error:
-        reason = (str(error).strip().splitlines() or [""])[0]
         yield Finding(
             "vmap",
-            f"the environment cannot be vmapped: {type(error).__name__}: {reason}",
+            f"the environment cannot be vmapped: {typed_reason(error)}",
             "write reset and step for one environment, with only jax.numpy; "
             "a pure_callback needs a vmap_method",
         )

@@ -310,6 +310,16 @@ def check_composable(env: object) -> None:
             )
 
 
+def with_true_reward(env: EnvironmentLike) -> EnvironmentLike:
+    """``env`` with the reward of its true state, so that its return is the true return."""
+    if not isinstance(env, Disturbed):
+        return env
+    params = env.default_params
+    if env.reward_from == "state" and isinstance(params.reward, NoDisturbance):
+        return env
+    return Disturbed(env.base, "state", params.replace(reward=NoDisturbance()))
+
+
 def warn_if_it_begins_too_late(env: Disturbed) -> None:
     """Warn of processes that begin within the episode, if its time limit is not known."""
     own = env.default_params

@@ -11,7 +11,7 @@ import numpy as np
 
 from rtd3jax.envs.entry import DEFAULT_STEP_LIMIT as DEFAULT_STEP_LIMIT
 from rtd3jax.envs.entry import check_gymnax
-from rtd3jax.errors import UserError
+from rtd3jax.errors import UserError, typed_reason
 from rtd3jax.protocols import EnvironmentLike
 
 MOST_BOUND = 1e20
@@ -212,9 +212,7 @@ def _attempt(name: str, what: str, call: Callable[[], Any]) -> Any:
     except UserError:
         raise
     except Exception as error:
-        lines = str(error).strip().splitlines()
-        reason = f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
-        raise UserError(f"environment {name} failed in {what}: {reason}") from error
+        raise UserError(f"environment {name} failed in {what}: {typed_reason(error)}") from error
 
 
 def _bounds(

@@ -9,7 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT
-from rtd3jax.errors import UserError
+from rtd3jax.errors import UserError, short_reason
 from rtd3jax.evaluation.rollout import check_counts
 from rtd3jax.policies.compatibility import check_compatible
 from rtd3jax.policies.trained import Policy
@@ -43,8 +43,7 @@ def run_in_gymnasium(
     try:
         env = gymnasium.make(gym_env)
     except (gymnasium.error.Error, ImportError) as error:
-        reason = (str(error).splitlines() or [""])[0]
-        raise UserError(f"Gymnasium cannot make {gym_env!r}: {reason}") from error
+        raise UserError(f"Gymnasium cannot make {gym_env!r}: {short_reason(error)}") from error
     try:
         return _play(policy, env, int(episodes), int(seed))
     finally:
@@ -111,8 +110,7 @@ def _check_spaces(policy: PolicyLike, env: gymnasium.Env) -> gymnasium.spaces.Bo
         shape = jax.eval_shape(act, policy, jax.eval_shape(policy.init, key), seen)[0].shape
     except TypeError as error:
         raise UserError(
-            f"{kind} cannot be compiled; make it a flax.struct.dataclass: "
-            f"{(str(error).splitlines() or [''])[0]}"
+            f"{kind} cannot be compiled; make it a flax.struct.dataclass: {short_reason(error)}"
         ) from error
     if shape != actions.shape:
         raise UserError(f"the policy's action has shape {shape}, the environment's {actions.shape}")

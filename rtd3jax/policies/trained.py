@@ -100,14 +100,14 @@ class Policy:
         """The state before the first step of an episode; ``key`` is not used."""
         check_choice("acting", self.acting, ACTINGS)
         action_size = self.bounds.low.shape[0]
-        runs_on = self.acting == "carry"
+        has_running_carry = self.acting == "carry"
         return PolicyState(
             steps=None
-            if runs_on
+            if has_running_carry
             else empty_steps(max(self.window_tokens, 1), self.observation_size, action_size),
             previous_action=jnp.zeros((action_size,), jnp.float32),
             time=jnp.int32(0),
-            carry=self.network.zero_carry(1) if runs_on else None,
+            carry=self.network.zero_carry(1) if has_running_carry else None,
         )
 
     def step(self, state: PolicyState, observation: jax.Array) -> tuple[jax.Array, PolicyState]:

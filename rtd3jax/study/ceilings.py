@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rtd3jax.envs.description import Ceiling
+from rtd3jax.envs.disturbed import with_true_reward
 from rtd3jax.errors import UserError, short_reason
 from rtd3jax.evaluation.ceiling import ceiling
 from rtd3jax.study.plan import Cell
@@ -20,9 +20,11 @@ FILE = "ceilings.json"
 def ceilings_of(
     directory: Path, cells: Sequence[Cell], *, compute: bool
 ) -> dict[tuple[str, str], dict[str, Any]]:
-    """For each (env, disturbance), the mean, standard error and kind, or why there is no ceiling.
+    """For each (env, disturbance), its ceiling, or why there is none.
 
-    Without ``compute``, only stored ceilings of this version are returned.
+    A ceiling has a mean, a standard error, a kind, and a measure: ``return``, or ``true_return`` if
+    only the ceiling of the return of the true state is known. Without ``compute``, only stored
+    ceilings of this version are returned.
     """
     path = directory / FILE
     version = versions_of(["rtd3jax"])["rtd3jax"]
@@ -32,7 +34,7 @@ def ceilings_of(
         name = " | ".join(environment)
         if name not in kept and compute:
             try:
-                kept[name] = _entry(ceiling(cell.make_env(), env_id=cell.env))
+                kept[name] = _ceiling(cell)
             except UserError as error:
                 found[environment] = {"missing": str(error)}
         if name in kept:
@@ -52,9 +54,17 @@ def compute_ceilings(directory: Path, cells: Sequence[Cell]) -> None:
         print(f"no ceilings: {reason}", file=sys.stderr)
 
 
-def _entry(best: Ceiling) -> dict[str, Any]:
+def _ceiling(cell: Cell) -> dict[str, Any]:
+    env, measure = cell.make_env(), "return"
+    try:
+        best = ceiling(env, env_id=cell.env)
+    except UserError:
+        truth, measure = with_true_reward(env), "true_return"
+        if truth is env:
+            raise
+        best = ceiling(truth, env_id=cell.env)
     mean, error = rounded_number(best.mean), rounded_number(best.standard_error)
-    return {"mean": mean, "error": error, "kind": best.kind}
+    return {"mean": mean, "error": error, "kind": best.kind, "measure": measure}
 
 
 def _read(path: Path, version: str) -> dict[str, dict[str, Any]]:
@@ -64,7 +74,7 @@ def _read(path: Path, version: str) -> dict[str, dict[str, Any]]:
             return {
                 name: entry
                 for name, entry in content["ceilings"].items()
-                if {"mean", "error", "kind"} <= set(entry)
+                if {"mean", "error", "kind", "measure"} <= set(entry)
             }
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         pass  # there is no file, or another version wrote it

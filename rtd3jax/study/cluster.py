@@ -201,8 +201,9 @@ def _check_nodes(
             except Exception as error:
                 if node["NodeID"] not in [other["NodeID"] for other in _alive(ray)]:
                     continue  # the node died, and Ray had not noticed it yet
-                reason = str(error).strip().splitlines()[-1]
-                raise UserError(f"--cluster: node {name} cannot work: {reason}") from error
+                raise UserError(
+                    f"--cluster: node {name} cannot work: {_last_line(error)}"
+                ) from error
             if problem:
                 raise UserError(f"--cluster: node {name}: {problem}")
             for package, version in mine.items():
@@ -304,6 +305,11 @@ def _bar(quiet: bool) -> Progress:
     )
 
 
+def _last_line(error: BaseException) -> str:
+    """The last line of an error of Ray, whose message is a traceback; else the error's type."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[-1]
+
+
 def _outcome(ray: ModuleType, task: Any, directory: RunDirectory, jobs: Sequence[Job]) -> list[str]:
     """The complaints of an ended task; the reason of a failure is stored with its lanes."""
     try:
@@ -312,7 +318,7 @@ def _outcome(ray: ModuleType, task: Any, directory: RunDirectory, jobs: Sequence
             file.write(json.dumps(report) + "\n")
         return complaints
     except Exception as error:
-        reason = str(error).strip().splitlines()[-1]
+        reason = _last_line(error)
         for job in jobs:
             cell, seed = job.key
             if not directory.lanes.is_done(cell, seed):

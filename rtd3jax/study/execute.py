@@ -13,8 +13,9 @@ from rtd3jax.study.plan import label
 from rtd3jax.study.recorder import Recorder
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.starts import add_starts
-from rtd3jax.training.checkpoint import MOST_NUMBERS, Checkpoints, named_numbers
+from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.lanes import Group, Job, advance_groups, make_groups, workers
+from rtd3jax.training.plant import MOST_NUMBERS, named_numbers
 from rtd3jax.training.progress import Progress
 
 

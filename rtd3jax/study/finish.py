@@ -20,11 +20,11 @@ def finish(
     Args:
         directory: the run directory.
         references: policies that need no training.
-        page: whether to write the page, and the ceilings that it shows.
+        page: whether to write the page.
         interrupted: whether the training was interrupted.
     """
     # Of several processes, only the last one writes ceilings and the complete page.
-    complete = page and directory.has_ended() and not interrupted
+    complete = directory.has_ended() and not interrupted
     if complete:
         compute_ceilings(directory.path, directory.cells)
     derive(directory, references)

@@ -139,7 +139,7 @@ class LaneFiles:
             history_length=cell.config.window_tokens,
             width=cell.config.hidden_size,
             memory=cell.config.memory,
-            acting="carry" if cell.config.runs_on else "window",
+            acting=cell.config.acting_mode,
             format=metadata.get("format", 1),
         )
 

@@ -57,7 +57,7 @@ def working_bytes(config: Config, observation_size: int, action_size: int) -> in
         tokens = (config.window_tokens + length) * (config.batch_size // length)
         activations = AGENTS[config.algorithm].peak_arrays * tokens * row
         activations += _PRESENT_STEPS * config.batch_size * row
-    acting = row if config.runs_on else array
+    acting = row if config.has_running_carry else array
     update = activations + _GRADIENTS * gradients
     return int(max(update, _ACTING * acting * config.eval_episodes))
 

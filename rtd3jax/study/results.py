@@ -24,6 +24,9 @@ from rtd3jax.system.parquet import read_parquet
 # EPISODES rows have history_length 0 and this seed, because neither has a meaning for them.
 REFERENCE_SEED = -1
 
+LANE = "lane"
+"""The column of a later test with the digest of the lane's file, whose policy was tested."""
+
 # What identifies one experimental cell; a cell plus a seed is one training lane.
 CELL = ("env", "disturbance", "algorithm", "history_length")
 

@@ -9,16 +9,19 @@ import numpy as np
 import pandas as pd
 
 from rtd3jax.errors import UserError
-from rtd3jax.evaluation.robustness import Case, check_policy, make_cases, rows_of
+from rtd3jax.evaluation.robustness import MEASURED, Case, check_policy, make_cases, rows_of
 from rtd3jax.evaluation.robustness_plot import plot_robustness
 from rtd3jax.evaluation.rollout import check_counts
 from rtd3jax.study.colours import ordered
 from rtd3jax.study.lane_files import file_name
 from rtd3jax.study.plan import Cell
-from rtd3jax.study.report.robustness import COLUMNS, FILE
-from rtd3jax.study.report.table import LANE
+from rtd3jax.study.results import CELL, LANE
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.system.files import write_bytes_atomically
+
+FILE = "robustness.parquet"
+COLUMNS = (*CELL, "seed", *MEASURED)
+"""One row per lane, stress and value: means over the episodes of a lane."""
 
 
 def run_robustness(

@@ -98,8 +98,11 @@ def _task_section(
     if best.get("mean") is not None:
         name = "ceiling" if best["kind"] == "exact" else "ceiling (an upper bound)"
         error = f" ± {number(best['error'])}" if best["error"] else ""
-        entries = [name, "–", "–", f"{number(best['mean'])}{error}", "–"]
-        lines.append(markdown_row(entries + ["–"] * differs))
+        value = f"{number(best['mean'])}{error}"
+        of_truth = differs and best["measure"] == "true_return"
+        entries = [name, "–", "–", "–" if of_truth else value, "–"]
+        entries += [value if of_truth else "–"] if differs else []
+        lines.append(markdown_row(entries))
     return [*lines, ""]
 
 

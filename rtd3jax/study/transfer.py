@@ -11,10 +11,14 @@ from rtd3jax.envs.registry import make, parse_disturbance
 from rtd3jax.errors import UserError
 from rtd3jax.evaluation.rollout import both_returns
 from rtd3jax.study.plan import Cell
-from rtd3jax.study.report.table import LANE
-from rtd3jax.study.report.transfer import COLUMNS, FILE
+from rtd3jax.study.results import LANE
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.system.files import write_bytes_atomically
+
+FILE = "transfer.parquet"
+CELL = ["env", "algorithm", "history_length", "trained_on", "tested_on"]
+COLUMNS = (*CELL, "seed", "episode", "return")
+"""One row per lane, tested disturbance and episode."""
 
 
 def transfer(

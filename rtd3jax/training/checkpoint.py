@@ -8,7 +8,6 @@ if the process may use the same number of cores on the same kind of processor: X
 by this number. Otherwise it differs by rounding.
 """
 
-import hashlib
 import json
 import re
 import tempfile
@@ -21,12 +20,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
 from rtd3jax.errors import UserError
 from rtd3jax.system.files import read_arrays, write_arrays
 from rtd3jax.system.versions import versions_of
 from rtd3jax.training.loop import Lane, LaneState, Program
+from rtd3jax.training.plant import PLANT
 
 DEFAULT_SECONDS = 300.0
 """Default time between two checkpoints of a lane; longer if writing one takes long."""
@@ -34,12 +33,6 @@ DEFAULT_SECONDS = 300.0
 _PATIENCE = 150
 """By default, the time between checkpoints is at least this many times the time that the last one
 took. With five lanes on two cores, checkpoints then take at most 2% of the time."""
-
-MOST_NUMBERS = 1_000
-"""Numbers of an array that the identity of a checkpoint contains; of a longer one, a digest."""
-
-PLANT = "plant"
-"""Part of an identity that earlier checkpoints do not have."""
 
 KEPT = 2
 LONGER = ("total_steps", "replay_capacity")
@@ -289,18 +282,6 @@ def why_not_longer(before: Mapping[str, Any], after: Mapping[str, Any], step: in
             f"({before['eval_every']:,})"
         )
     return None
-
-
-def named_numbers(leaf: ArrayLike) -> Any:
-    """A parameter of an environment, JSON-ready: its numbers, or a digest if there are many.
-
-    The numbers of a recording would make the header of every checkpoint too large.
-    """
-    array = np.asarray(leaf)
-    if array.size <= MOST_NUMBERS:
-        return array.tolist()
-    digest = hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
-    return f"{array.dtype}{list(array.shape)} of sha256 {digest}"
 
 
 def versions() -> dict[str, str]:

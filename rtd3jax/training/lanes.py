@@ -9,12 +9,10 @@ keep two cores equally busy.
 
 import contextlib
 import dataclasses
-import gc
 import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -26,9 +24,9 @@ from rtd3jax.envs.compat.simulator_state import simulator_handles
 from rtd3jax.errors import UserError
 from rtd3jax.system.interrupts import patient
 from rtd3jax.system.machine import cores
-from rtd3jax.system.program_cache import make_room, on_full
 from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.loop import HEALTHY, Lane, LaneState, Program, revived
+from rtd3jax.training.programs import compiled, structure_of
 from rtd3jax.training.start import Start
 
 CHUNK_SECONDS = 1.0
@@ -165,7 +163,7 @@ def make_groups(
         return [Group([job], wave=index // most) for index, job in enumerate(jobs)]
     by_program: dict[Any, list[Job]] = {}
     for job in jobs:
-        by_program.setdefault((job.program, _structure(job.lane)), []).append(job)
+        by_program.setdefault((job.program, structure_of(job.lane)), []).append(job)
     steps_of = checkpoints.steps if checkpoints is not None else lambda job: set()
     shares = []
     for members in by_program.values():
@@ -441,97 +439,3 @@ def _with_start(group: Group, state: LaneState, device: jax.Device) -> LaneState
                 for job, own in fresh.lanes()
             ]
         )
-
-
-_COPIES = 3
-"""Number of programs that differ only in the environment object, at which a warning is given."""
-
-
-def _warn_of_copies(program: Program) -> None:
-    """Warn once if each training uses a new environment object."""
-    kind = type(program.env)
-
-    def rest(program: Program) -> tuple[object, ...]:
-        return program.config, program.observation_size, program.action_shape
-
-    copies = {
-        id(other.env)
-        for other, *_ in _programs
-        if type(other.env) is kind and rest(other) == rest(program)
-    }
-    if kind.__eq__ is object.__eq__ and len(copies) + 1 == _COPIES:
-        warnings.warn(
-            f"{_COPIES} programs of {kind.__name__} differ only in the environment object; each "
-            "needs its own compilation and about 100 MiB: use one object, or inherit from "
-            "rtd.ValueIdentity, which defines when two objects are equal",
-            stacklevel=2,
-        )
-
-
-class _Compiled:
-    """The executables of one program; the first worker that needs them compiles them."""
-
-    def __init__(self) -> None:
-        self.lock = threading.Lock()
-        self.executables: tuple[Any, Any] | None = None
-
-
-_programs: dict[Any, _Compiled] = {}
-_programs_lock = threading.Lock()
-
-
-@on_full
-def _remove_programs() -> None:
-    """Remove all programs. A worker keeps the program that it is running; others compile again."""
-    with _programs_lock:
-        _programs.clear()
-
-
-def compiled(program: Program, lane: Lane, batched: bool, device: jax.Device) -> tuple[Any, Any]:
-    """``init`` and ``advance``, compiled once for equal programs."""
-    key = (program, _structure(lane), batched, device)
-    if key not in _programs:
-        make_room()
-    with _programs_lock:
-        if key not in _programs:
-            _warn_of_copies(program)
-        entry = _programs.setdefault(key, _Compiled())
-    with entry.lock:
-        if entry.executables is None:
-            entry.executables = _compile(program, lane, batched, device)
-        return entry.executables
-
-
-def _compile(program: Program, lane: Lane, batched: bool, device: jax.Device) -> tuple[Any, Any]:
-    init, advance = program.init, program.advance
-    options = {}
-    if batched:
-        init = jax.vmap(init)
-        advance = jax.vmap(advance, in_axes=(0, 0, None, None))
-    elif device.platform == "cpu":
-        options = {"xla_cpu_multi_thread_eigen": False}
-    begin = jax.jit(init, compiler_options=options)
-    go_on = jax.jit(advance, donate_argnums=1, compiler_options=options)
-    with ThreadPoolExecutor(1) as helper, _no_collection():
-        state, step = begin.eval_shape(lane), jax.ShapeDtypeStruct((), jnp.int32)
-        # The small program is compiled, or read from the cache, during the trace of the large one.
-        first = helper.submit(begin.lower(lane).compile)
-        second = go_on.lower(lane, state, step, step).compile()
-        return first.result(), second
-
-
-@contextlib.contextmanager
-def _no_collection() -> Iterator[None]:
-    """Switch off garbage collection during a trace, of which it would take a tenth of the time."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
-
-
-def _structure(lane: Lane) -> Any:
-    shapes = tuple((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(lane))
-    return jax.tree.structure(lane), shapes

@@ -192,7 +192,7 @@ class Program:
             centre_token=jnp.zeros((self.action_size,), jnp.float32),
             algorithm=self.config.algorithm,
             memory=self.config.memory,
-            acting="carry" if self.config.runs_on else "window",
+            acting=self.config.acting_mode,
             window_tokens=self.window_tokens,
             observation_size=self.observation_size,
             action_shape=self.action_shape,

@@ -1,6 +1,6 @@
 """Metrics of learning, averaged between evaluations inside the jitted loop.
 
-Shapes: ``K`` evaluations, ``M`` metrics.
+Shapes: ``K`` evaluations, ``M`` metrics, ``E`` environments.
 """
 
 import dataclasses

@@ -1,13 +1,21 @@
 """What identifies a plant in files: its parameters and its options, JSON-ready."""
 
+import hashlib
 from typing import Any
 
 import jax
+import numpy as np
+from jax.typing import ArrayLike
 
 from rtd3jax.envs.compat.simulated import is_simulated, simulated_identity
 from rtd3jax.envs.identity import in_words
 from rtd3jax.protocols import EnvironmentLike
-from rtd3jax.training.checkpoint import PLANT, named_numbers
+
+MOST_NUMBERS = 1_000
+"""Numbers of an array that the identity of a checkpoint contains; of a longer one, a digest."""
+
+PLANT = "plant"
+"""Part of an identity that earlier checkpoints do not have."""
 
 
 def plant_of(env: EnvironmentLike, params: object) -> dict[str, Any]:
@@ -23,3 +31,15 @@ def plant_of(env: EnvironmentLike, params: object) -> dict[str, Any]:
         name, options = simulated_identity(env), getattr(env, "reward_from", "")
     numbers = [named_numbers(leaf) for leaf in jax.tree.leaves(params)]
     return {"env": name, "params": numbers, PLANT: f"{options} with {in_words(params)}"}
+
+
+def named_numbers(leaf: ArrayLike) -> Any:
+    """A parameter of an environment, JSON-ready: its numbers, or a digest if there are many.
+
+    The numbers of a recording would make the header of every checkpoint too large.
+    """
+    array = np.asarray(leaf)
+    if array.size <= MOST_NUMBERS:
+        return array.tolist()
+    digest = hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
+    return f"{array.dtype}{list(array.shape)} of sha256 {digest}"

@@ -112,7 +112,7 @@ class Start:
 
     def _compare(self, there: Mapping[str, Any], here: Mapping[str, Any], program: Program) -> None:
         fields = ["algorithm", "hidden_size", "normalise_observations"]
-        if program.agent.acting.memory is not None:
+        if program.agent.acting_actor.memory is not None:
             fields.append("memory")
         for name in fields:
             before = there.get(name, getattr(Config, name, None))  # it may be older than the field

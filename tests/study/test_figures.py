@@ -242,21 +242,22 @@ def test_figures_keep_no_global_state():
 
 
 def test_ceilings_are_lines_where_they_are_known(tmp_path, drawn):
-    environments = ("none", "sine-slip", "other")
+    environments = ("none", "sine-slip", "other", "noise")
     made = [cell(level=-1.0, disturbance=name) for name in environments]
     curves, episodes = tables(*made)
     env = curves["env"].iloc[0]
     ceilings = {
-        (env, "none"): {"mean": -0.9, "kind": "exact"},
-        (env, "sine-slip"): {"mean": -0.5, "kind": "upper bound"},
+        (env, "none"): {"mean": -0.9, "kind": "exact", "measure": "return"},
+        (env, "sine-slip"): {"mean": -0.5, "kind": "upper bound", "measure": "return"},
+        (env, "noise"): {"mean": -0.5, "kind": "upper bound", "measure": "true_return"},
         (env, "other"): {"missing": "nobody knows"},
     }
     figures.learning_curves(curves, None, tmp_path, ceilings)
     figures.final_returns(episodes, tmp_path, ceilings)
     for figure in drawn:
         by_title = {axes.get_title().split(",")[0]: axes for axes in figure.axes}
-        found = [labels(by_title[t]) for t in ("no disturbance", "sine-slip", "other")]
+        found = [labels(by_title[t]) for t in ("no disturbance", "sine-slip", "other", "noise")]
         assert "ceiling" in found[0] and "upper bound" in found[1]
-        assert not {"ceiling", "upper bound"} & set(found[2])
+        assert not {"ceiling", "upper bound"} & {*found[2], *found[3]}
         words = [text.get_text() for text in figure.legends[0].get_texts()]
         assert words[-2:] == ["ceiling", "upper bound"]

@@ -172,8 +172,12 @@ def test_the_ceiling_is_the_last_row_where_it_is_known():
         text = summary_markdown({}, planned, episodes, [], {("pendulum", "none"): best})
         return table(text, "pendulum, none")[-1]
 
-    exact = {"mean": -1.206, "error": 0.001, "kind": "exact"}
+    exact = {"mean": -1.206, "error": 0.001, "kind": "exact", "measure": "return"}
     assert last(exact) == ["ceiling", "–", "–", "-1.206 ± 0.001", "–"]
-    bound = {"mean": -0.5, "error": 0.0, "kind": "upper bound"}
+    bound = {"mean": -0.5, "error": 0.0, "kind": "upper bound", "measure": "return"}
     assert last(bound) == ["ceiling (an upper bound)", "–", "–", "-0.5", "–"]
     assert last({"missing": "nobody knows"})[0] == "td3"
+    episodes["true_return"] -= 1.0
+    of_truth = {**bound, "measure": "true_return"}
+    assert last(of_truth) == ["ceiling (an upper bound)", "–", "–", "–", "–", "-0.5"]
+    assert last(bound) == ["ceiling (an upper bound)", "–", "–", "-0.5", "–", "–"]

@@ -106,7 +106,14 @@ def test_a_segment_is_consecutive_steps_of_one_environment(lane):
     rows, length = _episodes(state), 4
     first = jnp.arange(STEPS - CAPACITY, STEPS - (length - 1) * K, dtype=jnp.int32)
     batch = gather_segments(
-        state.replay, first, jnp.int32(STEPS), LENGTH, LENGTH, length, True, actor_goes_on=False
+        state.replay,
+        first,
+        jnp.int32(STEPS),
+        LENGTH,
+        LENGTH,
+        length,
+        True,
+        actor_reads_carries=False,
     )
     seen = np.asarray(batch.window.observation).reshape(length, len(first), 2)
     starts = np.asarray(batch.window.starts)
@@ -127,9 +134,9 @@ def test_stored_carries_are_those_with_which_the_actor_acted(lane):
     program, lane_, state = lane
     numbers = jnp.arange(STEPS - CAPACITY + LENGTH * K, STEPS - K, dtype=jnp.int32)
     batch = gather(state.replay, numbers, jnp.int32(STEPS), LENGTH, LENGTH)
-    network, actor = program.agent.acting, state.learner.actor
+    network, actor = program.agent.acting_actor, state.learner.actor
     window = batch.window
-    if program.config.runs_on:  # its memory reaches back to the episode's start
+    if program.config.has_running_carry:  # its memory reaches back to the episode's start
         window = window.replace(length=jnp.zeros_like(window.length))
         carried = act(network, actor, window, batch.carry)
         policy = program.policy(lane_, state)
@@ -174,7 +181,11 @@ def _with_action(program, policy, before, row):
 
     window = present(jnp.asarray(row["seen"])[None], jnp.asarray(row["previous"])[None])
     carry = advance(
-        program.agent.acting, policy.actor, window, jnp.asarray(row["action"])[None], before.carry
+        program.agent.acting_actor,
+        policy.actor,
+        window,
+        jnp.asarray(row["action"])[None],
+        before.carry,
     )
     return before.replace(carry=carry, previous_action=jnp.asarray(row["action"]))
 

@@ -111,7 +111,7 @@ def test_stored_carries_are_the_actors_own(lane):
     numbers = jnp.arange(STEPS - 1, dtype=jnp.int32)
     length = program.window_tokens
     batch = gather(state.replay, numbers, jnp.int32(STEPS), length, length)
-    actor, network = state.learner.actor, program.agent.acting
+    actor, network = state.learner.actor, program.agent.acting_actor
     for stored, window in ((batch.carry, batch.window), (batch.next_carry, batch.next_window)):
         for got, want in zip(stored, carry_before(network, actor, window), strict=True):
             # A cell state is as large as its age.
@@ -125,7 +125,7 @@ def test_the_newest_row_has_its_next_carry_when_its_episode_is_cut(lane):
     number, length = jnp.array([STEPS - 1], jnp.int32), program.window_tokens
     cut = jax.jit(program.cut)(one, state, jnp.int32(STEPS))
     batch = gather(cut.replay, number, jnp.int32(STEPS), length, length)
-    want = carry_before(program.agent.acting, state.learner.actor, batch.next_window)
+    want = carry_before(program.agent.acting_actor, state.learner.actor, batch.next_window)
     for got, own in zip(batch.next_carry, want, strict=True):
         assert np.any(own)
         np.testing.assert_allclose(got, own, rtol=1e-6, atol=1e-6)
@@ -140,10 +140,10 @@ def test_segments_go_on_from_the_carry_that_was_stored(lane, burn_in_gradient):
     count, length, burn_in = jnp.int32(STEPS), 3, 2
     first = jnp.arange(STEPS - length, dtype=jnp.int32)
     rows = state.replay, first, count, burn_in, burn_in, length, burn_in_gradient
-    stored = gather_segments(*rows, critic_reads_carries=False, actor_goes_on=True)
+    stored = gather_segments(*rows, critic_reads_carries=False, actor_reads_carries=True)
     number = (first[None, :] + jnp.arange(length)[:, None]).reshape(-1)
     whole = gather(state.replay, number, count, program.window_tokens, program.window_tokens)
-    actor, network = state.learner.actor, program.agent.acting
+    actor, network = state.learner.actor, program.agent.acting_actor
     for name in ("window", "next_window"):
         want = act(network, actor, getattr(whole, name))
         np.testing.assert_allclose(act(network, actor, getattr(stored, name)), want, atol=1e-6)

@@ -17,7 +17,7 @@ from jax.typing import ArrayLike
 
 from rtd3jax.envs.identity import ValueIdentity, strong
 from rtd3jax.envs.interface import foreign_code
-from rtd3jax.errors import UserError, nearest
+from rtd3jax.errors import UserError, nearest, typed_reason
 from rtd3jax.system.numbers import is_whole
 
 DEFAULT_EPISODE_LENGTH = 1_000
@@ -220,8 +220,7 @@ def _first_state(env: BraxLike, name: str) -> BraxStateLike:
         with foreign_code():
             state = jax.eval_shape(env.reset, key)
     except Exception as error:
-        reason = (str(error).strip().splitlines() or [""])[0]
-        raise UserError(f"{name} failed in reset: {type(error).__name__}: {reason}") from error
+        raise UserError(f"{name} failed in reset: {typed_reason(error)}") from error
     missing = [f for f in ("obs", "reward", "done", "metrics", "info") if not hasattr(state, f)]
     if missing:
         raise UserError(f"{name}: the State of reset has no {', '.join(missing)}")

@@ -11,7 +11,7 @@ import gymnasium
 from rtd3jax.envs.compat.simulated_environment import FromGymnasium
 from rtd3jax.envs.compat.simulator import Fleet, say
 from rtd3jax.envs.compat.surface import surface_of
-from rtd3jax.errors import UserError, nearest, short_reason
+from rtd3jax.errors import UserError, nearest, short_reason, typed_reason
 
 PREFIX = "gymnasium:"
 """Before an id of Gymnasium's where an environment is named."""
@@ -100,8 +100,7 @@ def _example(make: Callable[[], Any], env: object, title: str) -> gymnasium.Env:
             "import the module that registers it (--import in a sweep)"
         ) from error
     except Exception as error:
-        reason = f"{type(error).__name__}: {short_reason(error)}"
-        raise UserError(f"{title} cannot be made: {reason}") from error
+        raise UserError(f"{title} cannot be made: {typed_reason(error)}") from error
     if isinstance(example, gymnasium.vector.VectorEnv):
         _close(example)
         raise UserError(
@@ -121,5 +120,4 @@ def _close(example: gymnasium.Env | gymnasium.vector.VectorEnv) -> None:
     try:
         example.close()
     except Exception as error:
-        name, reason = type(example).__name__, short_reason(error)
-        say(f"close of {name} raised {type(error).__name__}: {reason}")
+        say(f"close of {type(example).__name__} raised {typed_reason(error)}")

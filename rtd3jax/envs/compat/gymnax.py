@@ -8,7 +8,7 @@ from jax.typing import ArrayLike
 
 from rtd3jax.envs.identity import ValueIdentity, strong, with_identity
 from rtd3jax.envs.interface import foreign_code
-from rtd3jax.errors import UserError
+from rtd3jax.errors import UserError, typed_reason
 
 
 class _Preset(ValueIdentity):
@@ -49,9 +49,7 @@ def make_gymnax(env_id: str, params: object = None) -> Any:
     try:
         base, defaults = gymnax.make(env_id)
     except Exception as error:
-        raise UserError(
-            f"environment {env_id} cannot be made: {type(error).__name__}: {error}"
-        ) from error
+        raise UserError(f"environment {env_id} cannot be made: {typed_reason(error)}") from error
     env: Any = object.__new__(with_identity(_Preset, type(base)))  # type: ignore[arg-type]
     params = defaults if params is None else params
     env.__dict__.update(vars(base), _preset_id=env_id, _preset_params=params)

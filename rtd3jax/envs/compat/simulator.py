@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from jax.typing import ArrayLike
 
-from rtd3jax.errors import UserError, short_reason
+from rtd3jax.errors import UserError, short_reason, typed_reason
 
 MOST = 1_024
 """Simulators that are open at once, before the one that was used longest ago is closed."""
@@ -149,8 +149,7 @@ class Simulator:
         except UserError as error:
             raise self.failed(str(error)) from error
         except BaseException as error:
-            message = f"{type(error).__name__}: {short_reason(error)}"
-            raise self.failed(f"{what} raised {message}") from error
+            raise self.failed(f"{what} raised {typed_reason(error)}") from error
 
     def _observation(self, what: str, observation: object) -> np.ndarray:
         try:

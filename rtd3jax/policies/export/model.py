@@ -73,7 +73,7 @@ class Model:
     acting: Acting = "window"
 
     @property
-    def runs_on(self) -> bool:
+    def has_running_carry(self) -> bool:
         """Whether the policy acts with a running carry from the start of the episode."""
         return self.acting == "carry"
 
@@ -92,7 +92,7 @@ class Model:
         """Shapes of the parts of the state for one episode, in the order of the files."""
         shapes: dict[str, tuple[int, ...]] = {}
         for name, shape in carry_shapes(self.network).items():
-            shapes[name] = shape if self.runs_on else (self.history_length, *shape)
+            shapes[name] = shape if self.has_running_carry else (self.history_length, *shape)
         if "previous_action" in (*self.memory, *self.current):
             shapes["previous_action"] = (self.action_size,)
         return shapes

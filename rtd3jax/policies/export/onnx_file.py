@@ -101,12 +101,12 @@ def _build(graph: _Graph, model: Model) -> None:
     carry: list[str] = []
     if model.memory:
         carry = [*_CARRIES[model.cell]]
-        if not model.runs_on:
+        if not model.has_running_carry:
             pads = graph.integers(0, 1, 0, 0, 0, 0)  # a zero row: the carry that starts here
             carry = [graph.add("Pad", [part, pads]) for part in carry]
         if model.memory_has_current:
             carry = _feed(graph, model, carry, observation)
-        if model.runs_on:
+        if model.has_running_carry:
             features.append(carry[0])
         else:
             features.append(_row(graph, carry[0], length))
@@ -164,14 +164,16 @@ def _feed(
     parts = _named(model.memory, observation=observation, action=action)
     token = graph.add("Relu", [graph.linear("encoder", graph.join(parts))])
     token = graph.linear("input", token)
-    if not model.runs_on:
+    if not model.has_running_carry:
         token = graph.add("Unsqueeze", [token, graph.integers(1)])
     cells: dict[str | None, Callable[..., list[str]]] = {
         "lstm": _lstm,
         "gru": _gru,
         "min-gru": _min_gru,
     }
-    return cells[model.cell](graph, model.width, token, *carry, axis=1 if model.runs_on else 2)
+    return cells[model.cell](
+        graph, model.width, token, *carry, axis=1 if model.has_running_carry else 2
+    )
 
 
 def _lstm(graph: _Graph, width: int, token: str, hidden: str, cell: str, *, axis: int) -> list[str]:

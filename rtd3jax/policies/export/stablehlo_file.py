@@ -91,12 +91,15 @@ def play(
     feature = None
     if model.memory:
         structure = jax.tree.structure(jax.eval_shape(lambda: network.zero_carry(1)))
-        carry = [state[n][:, None] if model.runs_on else _with_zero_row(state[n]) for n in names]
+        carry = [
+            state[n][:, None] if model.has_running_carry else _with_zero_row(state[n])
+            for n in names
+        ]
         if model.memory_has_current:
             carry = feed(carry)
         last = jax.tree.unflatten(structure, [part[:, -1] for part in carry])
         feature = network.apply(variables, last, method=lambda m, c: m.memory.read(c))
-        if not model.runs_on:
+        if not model.has_running_carry:
             carry = [part[:, :-1] for part in carry]
     current = None
     if model.current:
@@ -111,7 +114,7 @@ def play(
     parts["action"] = token
     if model.memory and not model.memory_has_current:
         carry = feed(carry)
-    if model.runs_on:
+    if model.has_running_carry:
         carry = [part[:, 0] for part in carry]
     following = {"previous_action": token, **dict(zip(names, carry, strict=True))}
     action = action.reshape(-1, *model.action_shape)

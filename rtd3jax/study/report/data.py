@@ -82,7 +82,7 @@ def study_data(
                 "length": cell.config.history_length,
                 "seeds": len(directory.seeds),
                 "begun": begun[tuple(cell.key[name] for name in CELL)],
-                "curves": {m: _curve(rows_of(curves, cell), m) for m in measures},
+                "curves": {m: curve_data(rows_of(curves, cell), m, "step") for m in measures},
                 "learning": _learning(rows_of(metrics, cell)),
                 "final": {m: _final(rows_of(lanes, cell), m) for m in measures},
             }
@@ -143,18 +143,22 @@ def _references(
     return found
 
 
-def _curve(rows: pd.DataFrame, measure: str) -> dict[str, Any] | None:
-    """IQM over the seeds with the bounds of its interval, at each evaluation."""
+def curve_data(rows: pd.DataFrame, measure: str, along: str) -> dict[str, Any] | None:
+    """IQM over the seeds with the bounds of its interval, at each value of the column ``along``.
+
+    The page calls these values "steps". Of more than `MOST_POINTS`, an evenly spaced part is left.
+    """
     rows = rows[np.isfinite(rows[measure].astype(np.float64))]
     if rows.empty:
         return None
-    table = rows.pivot(index="seed", columns="step", values=measure)
+    table = rows.pivot(index="seed", columns=along, values=measure)
     if table.shape[1] > MOST_POINTS:
         points = np.unique(np.linspace(0, table.shape[1] - 1, MOST_POINTS).round().astype(int))
         table = table.iloc[:, points]
     count, iqm, low, high = iqm_bands(table.to_numpy(np.float64))
+    number = int if table.columns.dtype.kind in "iu" else rounded_number  # all digits of steps
     return {
-        "steps": [int(step) for step in table.columns],
+        "steps": [number(value) for value in table.columns],
         "seeds": [int(seeds) for seeds in count],
         "iqm": [rounded_number(value) for value in iqm],
         "low": [rounded_number(value) for value in low],

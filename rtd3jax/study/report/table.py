@@ -6,11 +6,9 @@ from pathlib import Path
 import pandas as pd
 
 from rtd3jax.errors import UserError
+from rtd3jax.study.results import LANE
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.system.parquet import read_parquet
-
-LANE = "lane"
-"""The column with the digest of the lane's file, whose policy was tested."""
 
 
 def policies_of(directory: RunDirectory) -> set[str]:

@@ -9,11 +9,7 @@ from rtd3jax.study.report.data import summary_data
 from rtd3jax.study.report.table import of_these_policies, read_table
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.statistics import summarise
-
-FILE = "transfer.parquet"
-_CELL = ["env", "algorithm", "history_length", "trained_on", "tested_on"]
-COLUMNS = (*_CELL, "seed", "episode", "return")
-"""One row per lane, tested disturbance and episode."""
+from rtd3jax.study.transfer import CELL, COLUMNS, FILE
 
 
 def transfer_data(
@@ -33,15 +29,15 @@ def transfer_data(
     if table.empty:
         return None
     table = table.astype({"return": np.float64})
-    seeds = table.groupby([*_CELL, "seed"], sort=False)["return"]
+    seeds = table.groupby([*CELL, "seed"], sort=False)["return"]
     # As in `seed_means`: a lane with a NaN episode has no mean.
     means = seeds.agg(lambda episodes: episodes.mean(skipna=False)).reset_index()
     return [
         {
-            **dict(zip(_CELL, map(_plain, cell), strict=True)),
+            **dict(zip(CELL, map(_plain, cell), strict=True)),
             **summary_data(summarise(rows["return"])),
         }
-        for cell, rows in means.groupby(_CELL, sort=False)
+        for cell, rows in means.groupby(CELL, sort=False)
     ]
 
 

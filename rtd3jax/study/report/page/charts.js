@@ -34,9 +34,11 @@ const OTHER_DASHES = ['9 3 2 3', '5 3', '9 3 2 3 2 3', '14 4'];
 
 function referencesOf(environment, measure) {
   const found = environment.references.map((r) => ({ name: r.name, value: r[measure] }));
-  if (environment.ceiling && finite(environment.ceiling.mean)) {
-    const name = environment.ceiling.kind === 'exact' ? 'ceiling' : 'ceiling (upper bound)';
-    found.push({ name, value: environment.ceiling.mean, ceiling: true });
+  const best = environment.ceiling;
+  // Under a disturbed reward, only the ceiling of the return of the true state is known.
+  if (best && finite(best.mean) && (best.measure === 'return' || best.measure === measure)) {
+    const name = best.kind === 'exact' ? 'ceiling' : 'ceiling (upper bound)';
+    found.push({ name, value: best.mean, ceiling: true });
   }
   return found.filter((r) => finite(r.value));
 }
