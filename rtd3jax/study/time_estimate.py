@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from rtd3jax.config import Config
+from rtd3jax.training.executables import compiled
 from rtd3jax.training.lanes import Job, stacked, workers
 from rtd3jax.training.loop import Program
-from rtd3jax.training.programs import compiled
 
 MOST_PROGRAMS = 4
 """Maximum number of programs that are timed, because each must be compiled."""

@@ -25,8 +25,8 @@ from rtd3jax.errors import UserError
 from rtd3jax.system.interrupts import patient
 from rtd3jax.system.machine import cores
 from rtd3jax.training.checkpoint import Checkpoints
+from rtd3jax.training.executables import compiled, structure_of
 from rtd3jax.training.loop import HEALTHY, Lane, LaneState, Program, revived
-from rtd3jax.training.programs import compiled, structure_of
 from rtd3jax.training.start import Start
 
 CHUNK_SECONDS = 1.0

@@ -11,7 +11,7 @@ import rtd3jax as rtd
 from experiments.benchmarks import bench, lanes_on_device, products, report
 from experiments.benchmarks.torch_processes import ONE_PROCESS, PROCESS_PER_CORE, ROOT
 from rtd3jax.study.plan import update_flops
-from rtd3jax.training import programs
+from rtd3jax.training import executables
 
 QUICK = ["--quick", "--no-torch", "--out"]
 
@@ -58,7 +58,7 @@ def test_no_step_copies_the_replay(measured):
     capacity = bench.QUICK.replay_capacity
     texts = [
         entry.executables[1].as_text()
-        for (program, *_), entry in programs._programs.items()
+        for (program, *_), entry in executables._programs.items()
         if program.config.replay_capacity == capacity
     ]
     assert texts

@@ -7,7 +7,7 @@ from gymnax.environments import environment
 
 import rtd3jax as rtd
 from rtd3jax.system import program_cache as programs
-from rtd3jax.training import lanes
+from rtd3jax.training import executables, lanes
 from rtd3jax.training.loop import make_lane, make_program
 
 SETTINGS = {"hidden_size": 4, "batch_size": 4, "learning_starts": 10, "total_steps": 60}
@@ -60,9 +60,9 @@ def test_programs_and_their_mappings_go(monkeypatch):
     monkeypatch.setattr(programs, "_SECONDS", 0.0)
     train()
     before, _ = programs._mappings()
-    assert before > 300 and lanes._programs
+    assert before > 300 and executables._programs
     monkeypatch.setattr(programs, "_SHARE", 0.0)
-    assert programs.make_room() and not lanes._programs
+    assert programs.make_room() and not executables._programs
     after, limit = programs._mappings()
     assert after < before - 300 and limit > after
 
@@ -88,15 +88,15 @@ def test_equal_environments_share_a_program_and_copies_are_warned_of(monkeypatch
         def identity(self):
             return (self.pipes,)
 
-    monkeypatch.setattr(lanes, "_programs", {})
-    monkeypatch.setattr(lanes, "_compile", lambda *_: ())
+    monkeypatch.setattr(executables, "_programs", {})
+    monkeypatch.setattr(executables, "_compile", lambda *_: ())
     lane = make_lane(rtd.Config("td3", **SETTINGS), 0, ())
     device = lanes.workers()[0]
 
     def compiled(env, **changes):
         config = rtd.Config("td3", **SETTINGS | changes)
         lanes.compiled(make_program(env, config, 1, (1,)), lane, False, device)
-        return len(lanes._programs)
+        return len(executables._programs)
 
     assert [compiled(Equal()) for _ in range(4)] == [1] * 4
     assert compiled(Equal(2)) == 2
