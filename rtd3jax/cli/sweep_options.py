@@ -149,7 +149,7 @@ def parser(description: str | None) -> argparse.ArgumentParser:
 
 
 def _kind(hint: object) -> type:
-    """What a field of this type reads from the command line: text, or a number."""
+    """The type that a field of this type reads from the command line: text, or a number."""
     if get_origin(hint) is Literal:
         return str
     parts = [part for part in get_args(hint) if part is not type(None)]

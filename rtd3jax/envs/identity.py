@@ -69,7 +69,7 @@ _WORDS = (str, bool, int, float)
 
 
 def in_words(thing: object) -> str:
-    """What distinguishes environments or parameters beside numbers, equal in every process.
+    """All that distinguishes environments or parameters except numbers, equal in every process.
 
     These are the types, an environment's static options, and the static fields of parameters.
     """

@@ -166,7 +166,7 @@ def _refit(wave: np.ndarray, bound: float, start: np.ndarray, offset: float) -> 
 
 
 def _limits(time: np.ndarray, bound: float) -> tuple[np.ndarray, np.ndarray]:
-    """What a wave of slip can be: without them, half a wave of any height fits a slope."""
+    """Limits of a wave of slip. Without limits, half a wave of any height fits a slope."""
     slowest = np.pi / len(time)
     low, high = [-bound, -bound, slowest, -bound], [bound, bound, np.pi, 2.0 * bound]
     return np.array(low), np.array(high)
@@ -214,12 +214,12 @@ def _profile(wave: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _variance(residuals: Sequence[np.ndarray], parameters: int) -> float:
-    """Of what is left, each wave having cost some degrees of freedom."""
+    """The variance of the residuals; each wave takes ``parameters`` degrees of freedom."""
     freedom = sum(len(part) - parameters for part in residuals)
     return max(sum(float(part @ part) for part in residuals) / freedom, 1e-16)
 
 
 def _covariance(slopes: np.ndarray, variance: float) -> np.ndarray:
-    """Of the parameters of least squares."""
+    """The covariance of the estimates of least squares."""
     # A wave that is clipped throughout says nothing: it has no weight, rather than all of it.
     return variance * np.linalg.inv(slopes.T @ slopes + 1e-12 * np.eye(slopes.shape[1]))

@@ -41,7 +41,7 @@ from rtd3jax.training.lanes import Job, workers
 TASKS = "cluster.jsonl"
 """File with a line per ended task: its cell, node and times, and the steps of its checkpoints."""
 _POLL_SECONDS = 0.1
-_KNOCK_SECONDS = 10.0
+_CONNECT_SECONDS = 10.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,7 +142,7 @@ def _check_listening(address: str) -> None:
     """Raise an error at once if nothing listens at ``address``: Ray would retry for minutes."""
     host, colon, port = address.rpartition("://")[2].rpartition(":")
     if colon:
-        socket.create_connection((host.strip("[]"), int(port)), timeout=_KNOCK_SECONDS).close()
+        socket.create_connection((host.strip("[]"), int(port)), timeout=_CONNECT_SECONDS).close()
 
 
 def _need(members: Sequence[Job], work: Work, nodes: Sequence[dict]) -> Need:

@@ -143,7 +143,7 @@ class Crew:
         self.members.append(member)
 
     def messages(self, seconds: float) -> Iterator[tuple[Member, dict[str, Any] | None]]:
-        """What processes have written, waiting ``seconds`` for the first; None for an end."""
+        """Messages of processes, after at most ``seconds``; None for a process that has ended."""
         with contextlib.suppress(queue.Empty):
             yield self._messages.get(timeout=seconds)
             while True:

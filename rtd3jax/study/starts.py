@@ -1,4 +1,4 @@
-"""What the lanes of a cell go on from: lanes of another run directory, or a saved policy."""
+"""The networks from which the lanes of a cell start: of another run, or of a saved policy."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -72,7 +72,7 @@ def _place(start: str) -> tuple[Path, str]:
 
 
 def starts_of(cell: Cell, seeds: Sequence[int]) -> dict[int, Start]:
-    """Of each seed; empty where the cell begins with new weights.
+    """The start of each seed; empty if the cell begins with new weights.
 
     Raises:
         UserError: when ``start`` of the cell's configuration names nothing that can be read, or no

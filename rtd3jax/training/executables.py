@@ -104,6 +104,6 @@ def _no_collection() -> Iterator[None]:
 
 
 def structure_of(lane: Lane) -> Any:
-    """What two lanes must have in common to share an executable of equal programs."""
+    """The part of a lane in which two lanes with the same executable must be equal."""
     shapes = tuple((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(lane))
     return jax.tree.structure(lane), shapes

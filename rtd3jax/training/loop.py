@@ -283,7 +283,7 @@ class Program:
     def _window(
         self, lane: Lane, state: LaneState, step: jax.Array, normaliser: Normaliser | None
     ) -> Window:
-        """What the actor reads at the ``step`` of all environments."""
+        """The windows that the actor reads at the ``step`` of all environments."""
         present = present_window(
             state.replay,
             step,

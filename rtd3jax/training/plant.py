@@ -1,4 +1,4 @@
-"""What identifies a plant in files: its parameters and its options, JSON-ready."""
+"""The identity of a plant in files: its parameters and its options, JSON-ready."""
 
 import hashlib
 from typing import Any

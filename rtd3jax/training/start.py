@@ -25,23 +25,23 @@ from rtd3jax.training.checkpoint import checkpoint_files, leaves_from_arrays
 from rtd3jax.training.loop import HEALTHY, Lane, LaneState, Program
 
 KNOWN_OBSERVATIONS = 1_000
-"""What a policy's statistics weigh, in observations, against those that the new lane will see."""
+"""The number of observations as which a policy's statistics count in those of the new lane."""
 
 _TAKEN = "learner", "statistics", "true_statistics"
-"""Of a lane's checkpoint: the parts of a `LaneState` that training goes on from."""
+"""The parts of a `LaneState` in a lane's checkpoint from which training continues."""
 _FATE = ".failure", ".failed_at"
 
 
 @dataclasses.dataclass(frozen=True)
 class Start:
-    """What one lane begins from.
+    """The networks from which one lane starts.
 
     Attributes:
-        where: what it is, for people.
-        policy: the trained policy, where that is all there is.
-        checkpoint: the file of a lane that has more; None otherwise.
-        missing: why there is neither any more. A lane that is under way does not need its start,
-            unless its own checkpoints are lost.
+        where: a name of the source, for people.
+        policy: the trained policy, if the source has no more than that.
+        checkpoint: the checkpoint of a lane, which has more than the policy; None without it.
+        missing: the reason why neither can be read. A lane that is under way does not need its
+            start, unless its own checkpoints are lost.
     """
 
     where: str
@@ -51,7 +51,7 @@ class Start:
 
     @property
     def about(self) -> str:
-        """What is taken from where, for tables."""
+        """What the lane takes over, and from where, for tables."""
         whole = "actor, critics and optimisers" if self.checkpoint is not None else "actor"
         return f"{whole} of {self.where}"
 
@@ -124,8 +124,8 @@ class Start:
 
     @functools.cached_property
     def _read(self) -> tuple[dict[str, np.ndarray], Any]:
-        """What is gone on from, by its names in the checkpoint, without the replay; and its lane's
-        identity."""
+        """The arrays from which training continues, by their names in the checkpoint, and the
+        identity of its lane. The replay is left out."""
         assert self.checkpoint is not None
         arrays, about = read_arrays(self.checkpoint)
         places = tuple(f".{name}{mark}" for name in _TAKEN for mark in ".[")
@@ -150,7 +150,7 @@ class Start:
 
 
 def starts_of_path(path: str | Path, seeds: tuple[int, ...]) -> dict[int, Start]:
-    """Of each seed, from a saved policy, or from the ``checkpoint_dir`` of a `rtd.train`.
+    """The start of each seed, from a saved policy or the ``checkpoint_dir`` of a `rtd.train`.
 
     Raises:
         UserError: when there is neither, or a seed has no checkpoint there.

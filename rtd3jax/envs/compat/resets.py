@@ -9,7 +9,7 @@ from jax.typing import ArrayLike
 
 
 class ResettableWhere(Protocol):
-    """What `step_with_reset` needs."""
+    """The methods of an environment that `step_with_reset` calls."""
 
     step_env: Callable[..., tuple]
     is_truncated: Callable[..., jax.Array]

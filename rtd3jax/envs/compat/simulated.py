@@ -1,4 +1,4 @@
-"""What the rest of the package asks of an environment that a simulator on the host may play."""
+"""Questions about an environment that a simulator on the host may play."""
 
 import jax
 import numpy as np
@@ -28,7 +28,7 @@ def is_simulated(env: object) -> bool:
 
 
 def simulated_identity(env: object) -> str:
-    """What a simulator's environment was made of, as checkpoints have it."""
+    """The construction of a simulator's environment, as checkpoints store it."""
     base = innermost(env)
     assert isinstance(base, FromGymnasium)
     made, kwargs, keep, limit, _ = base.identity()

@@ -29,7 +29,7 @@ _Whole = np.ndarray | jax.Array
 
 
 class SimulatorParams(struct.PyTreeNode):
-    """What can be set from outside; everything else is the environment's own."""
+    """The parameters that can be set from outside; all others belong to the simulator."""
 
     max_steps_in_episode: int = DEFAULT_STEP_LIMIT
 
@@ -45,7 +45,7 @@ class FromGymnasium(ValueIdentity, environment.Environment):
         self._surface = surface
 
     def identity(self) -> tuple:
-        """What it was made of."""
+        """The arguments with which it was made."""
         return self._key
 
     @property
@@ -248,7 +248,7 @@ class FromGymnasium(ValueIdentity, environment.Environment):
 
 
 def _place(seed: _Whole, time: _Whole, digest: ArrayLike) -> tuple[int, int, tuple[int, int]]:
-    """Where a simulator is to be, as `Fleet.at` has it."""
+    """The position of a simulator as `Fleet.at` takes it: seed, time and digest."""
     first, second = np.asarray(digest).tolist()
     return int(seed), int(time), (first, second)
 

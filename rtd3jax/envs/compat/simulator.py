@@ -1,8 +1,9 @@
-"""Gymnasium simulators on the host: who has which, and where in its episode each one is.
+"""Gymnasium simulators on the host: their allocation to lanes, and their positions in episodes.
 
-A place in an episode is its reset seed and the actions since. A simulator that is asked for a place
-where it is not (after a resume, or since it was closed meanwhile) is replayed from the seed, and a
-digest of all that it answered tells whether it came to the same place to the bit.
+A position is the seed of an episode's reset and the actions since then. If a lane asks a simulator
+for another position (after a resume, or after the simulator was closed), the simulator replays the
+episode from its seed, and a digest of all its answers shows whether it reached the same position,
+bit for bit.
 """
 
 import atexit
@@ -32,7 +33,7 @@ _CLOSING_SECONDS = 5.0
 
 
 class Fault(Exception):
-    """What a simulator did wrong, in one line."""
+    """A fault of a simulator, in one line."""
 
 
 class _Thread:
@@ -133,7 +134,7 @@ class Simulator:
         self._thread.end()
 
     def failed(self, message: str) -> Fault:
-        """What is to be raised of it now, and whenever it is asked again."""
+        """Record the fault; return the exception to raise now and at later calls."""
         self.fault = f"the simulator failed: {message}"
         return Fault(self.fault)
 
@@ -308,7 +309,7 @@ class Fleet:
             return len(self._free) + sum(s.fault is None for s in self._busy.values())
 
     def fault(self, handle: int) -> str | None:
-        """What went wrong with a simulator."""
+        """The fault of a simulator."""
         with self._lock:
             simulator = self._busy.get(handle)
             return None if simulator is None else simulator.fault
@@ -335,7 +336,7 @@ _fleets: list[Fleet] = []
 
 
 def fault_of(handle: int) -> str | None:
-    """What went wrong with the simulator of this handle, in this process."""
+    """The fault of the simulator of this handle in this process."""
     return next((found for fleet in list(_fleets) if (found := fleet.fault(handle))), None)
 
 

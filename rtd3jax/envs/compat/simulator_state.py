@@ -33,7 +33,7 @@ def simulator_state(env_state: object) -> SimulatorState | None:
 
 
 def simulator_handles(env_state: object) -> list[int]:
-    """Of the simulators that play a state, or several; empty where none do."""
+    """The handles of the simulators that play one state or several; empty without simulators."""
     found = simulator_state(env_state)
     return [] if found is None else np.asarray(found.handle).reshape(-1).tolist()
 

@@ -16,7 +16,14 @@ from rtd3jax.system.numbers import is_whole
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Surface:
-    """What the outside of an environment is like."""
+    """The spaces of an environment, and the elements of its observation that an agent sees.
+
+    Attributes:
+        actions: the action space.
+        names: a name for each element of the whole observation.
+        keep: indices of the elements that an agent sees.
+        limit: the time limit, in steps.
+    """
 
     actions: gymnasium.spaces.Box
     names: tuple[str, ...]
@@ -25,7 +32,7 @@ class Surface:
 
     @functools.cached_property
     def indices(self) -> np.ndarray:
-        """The elements that are seen, as an index."""
+        """``keep`` as an array."""
         return np.asarray(self.keep)
 
     @functools.cached_property
@@ -34,7 +41,7 @@ class Surface:
         return self.actions.low.astype(np.float64), self.actions.high.astype(np.float64)
 
     def command(self, action: np.ndarray) -> np.ndarray:
-        """What the environment is given for an ``action`` [A]: within its bounds, in its type."""
+        """``action`` [A] as the environment gets it: within its bounds, of its type."""
         low, high = self.bounds
         wide = action.astype(np.float64).reshape(low.shape)
         within = np.minimum(np.maximum(wide, low), high)
@@ -43,7 +50,7 @@ class Surface:
         return within.astype(self.actions.dtype)
 
     def seen(self, flat: np.ndarray) -> np.ndarray:
-        """The kept elements of all that it showed, float32 [O]."""
+        """The kept elements, float32 [O], of a flat observation."""
         return flat[self.indices].astype(np.float32)
 
 

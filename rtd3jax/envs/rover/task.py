@@ -15,7 +15,7 @@ from rtd3jax.envs.processes.process import float32
 
 
 class TaskParams(Protocol):
-    """What the task reads of a rover's parameters."""
+    """The parameters of a rover that the task reads."""
 
     target_speed: float
     target_yaw_rate: float
@@ -24,7 +24,7 @@ class TaskParams(Protocol):
 
 
 class MotionState(Protocol):
-    """What the task reads of a rover's state."""
+    """The part of a rover's state that the task reads."""
 
     speed: jax.Array
     yaw_rate: jax.Array
@@ -34,7 +34,7 @@ class DrivingTask(ValueIdentity, environment.Environment):
     """Task: hold a speed and a yaw rate. Actions [2] command them; observations [2] are errors."""
 
     def outcome(self, evolved: Any, params: Any) -> tuple[Any, Any, jax.Array, jax.Array, dict]:
-        """What ``step_env`` returns for the state after it; the reward [] is that of its motion."""
+        """What ``step_env`` returns for the state after a step; the reward [] is of its motion."""
         observation = errors(evolved, params)
         reward = -jnp.sum(observation**2)
         observation, evolved = self._apply_transition_gradient_policy(observation, strong(evolved))

@@ -1,4 +1,4 @@
-"""What an engineer writes down for a rover on soil, without training."""
+"""Controllers of a rover on soil that need no training."""
 
 from typing import NamedTuple
 

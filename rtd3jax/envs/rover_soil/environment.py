@@ -37,7 +37,7 @@ from rtd3jax.envs.rover_soil.wheel import (
 from rtd3jax.errors import UserError
 
 SUBSTEPS = 4
-"""Of the implicit integration within a step."""
+"""Steps of the implicit integration within a step of the environment."""
 SLOWEST = 0.05
 """m/s: below it slip is measured against this speed, and a wheel's rolling resistance fades."""
 
@@ -126,7 +126,7 @@ class RoverSoil(DrivingTask):
 
     @property
     def default_params(self) -> RoverSoilParams:
-        """Those given at construction, else a rover on even dry sand."""
+        """The parameters given at construction; without them, a rover on even dry sand."""
         return RoverSoilParams() if self._default_params is None else self._default_params
 
     def reset_env(
@@ -193,7 +193,7 @@ def ground_of(params: RoverSoilParams) -> Ground:
 
 
 def check_ground(params: RoverSoilParams) -> None:
-    """Raise UserError for what is no ground, or a ground in which the wheels drown."""
+    """Raise UserError for another object, or a ground in which a wheel sinks below its axle."""
     if not isinstance(params.ground, Ground | NoDisturbance):
         kind = type(params.ground).__name__
         raise UserError(
@@ -235,7 +235,7 @@ def wheel_load(params: RoverSoilParams, slope: jax.Array) -> jax.Array:
 
 
 def wheel_places(params: RoverSoilParams, place: jax.Array, heading: jax.Array) -> jax.Array:
-    """Where the wheels are, [2, 2] m."""
+    """The positions of the wheels, [2, 2] m."""
     half = 0.5 * float32(params.wheelbase)
     across = half * jnp.stack([-jnp.sin(heading), jnp.cos(heading)])
     return jnp.stack([place + across, place - across])

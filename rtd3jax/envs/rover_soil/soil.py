@@ -89,7 +89,7 @@ is theirs without a slip angle."""
 
 
 class LocalSoil(NamedTuple):
-    """What a wheel of a given width meets; all float32 of one shape.
+    """The soil under a wheel of a given width; all float32 arrays of one shape.
 
     Attributes:
         cohesion: c, Pa.

@@ -55,7 +55,7 @@ class Wheel(struct.PyTreeNode):
 
 
 class Forces(NamedTuple):
-    """Of the soil on a wheel; the shape of the entry angle each.
+    """Forces of the soil on a wheel, each with the shape of the entry angle.
 
     Attributes:
         vertical: N, upwards.
@@ -127,14 +127,14 @@ def contact_forces(
 
 
 def sine_of(angle: jax.Array) -> jax.Array:
-    """Of an angle within a quarter turn, by its series: within 6e-8, and computed in vectors."""
+    """The sine of an angle within a quarter turn, by its series: within 6e-8, and vectorised."""
     square = angle * angle
     series = _horner(square, (1.0, -1 / 6, 1 / 120, -1 / 5040, 1 / 362_880, -1 / 39_916_800))
     return angle * series
 
 
 def cosine_of(angle: jax.Array) -> jax.Array:
-    """Of an angle within a quarter turn, as `sine_of`."""
+    """The cosine of an angle within a quarter turn, as `sine_of`."""
     coefficients = (1.0, -1 / 2, 1 / 24, -1 / 720, 1 / 40_320, -1 / 3_628_800, 1 / 479_001_600)
     return _horner(angle * angle, coefficients)
 
@@ -148,7 +148,7 @@ def _horner(value: jax.Array, coefficients: tuple[float, ...]) -> jax.Array:
 
 
 def exit_angle(soil: LocalSoil, entry: jax.Array) -> jax.Array:
-    """Where the soil leaves the wheel, behind the axle: the sinkage there is lambda of the sinkage.
+    """The exit angle, behind the axle: the sinkage there is lambda times the whole sinkage.
 
     ``-arccos(1 - lambda (1 - cos(entry)))``, by half angles: of the sine, which float32 keeps.
     """
@@ -157,7 +157,7 @@ def exit_angle(soil: LocalSoil, entry: jax.Array) -> jax.Array:
 
 
 def _arcsine(sine: jax.Array) -> jax.Array:
-    """Of 0 to 1, within 2e-7: Abramowitz and Stegun, Handbook of Mathematical Functions, 4.4.46."""
+    """The arcsine of 0 to 1, within 2e-7 (Abramowitz and Stegun 1964, 4.4.46)."""
     series = _horner(sine, _ARCSINE)
     return 0.5 * jnp.pi - jnp.sqrt(1.0 - sine) * series
 
