@@ -15,9 +15,8 @@ from jax.typing import ArrayLike
 from rtd3jax.envs.compat.simulated import fleet_of
 from rtd3jax.envs.compat.simulator import fault_of
 from rtd3jax.envs.compat.simulator_state import simulator_handles, without_handles
-from rtd3jax.envs.entry import parameters_of
+from rtd3jax.envs.entry import DEFAULT_STEP_LIMIT, parameters_of
 from rtd3jax.envs.interface import (
-    DEFAULT_STEP_LIMIT,
     Interface,
     Survey,
     changes_of_type,

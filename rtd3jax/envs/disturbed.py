@@ -11,9 +11,9 @@ from jax.typing import ArrayLike
 
 from rtd3jax.envs.compat.resets import step_with_reset
 from rtd3jax.envs.compat.simulated import is_simulated
-from rtd3jax.envs.entry import parameters_of
+from rtd3jax.envs.entry import DEFAULT_STEP_LIMIT, parameters_of, step_limit
 from rtd3jax.envs.identity import ValueIdentity, strong
-from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT, describe, environment_name, foreign_code
+from rtd3jax.envs.interface import describe, environment_name, foreign_code
 from rtd3jax.envs.processes.disturbances import Hidden
 from rtd3jax.envs.processes.mixture import Mixture
 from rtd3jax.envs.processes.process import Chain, NoDisturbance, Process
@@ -163,7 +163,7 @@ class Disturbed(ValueIdentity, environment.Environment):
             actions = _action_size(self.base, params.env)
         (full,) = true_observation.shape
         self._size(params, full)
-        horizon = getattr(params, "max_steps_in_episode", DEFAULT_STEP_LIMIT)
+        horizon = step_limit(params)
         process = params.observation.init(key_init, horizon, full)
         observation, process = params.observation.step(key_process, process, true_observation)
         state = DisturbedState(

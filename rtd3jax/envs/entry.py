@@ -18,6 +18,11 @@ METHODS = ("reset", "step", "action_space")
 """Methods that every gymnax environment has."""
 
 
+def step_limit(params: object) -> Any:
+    """The time limit of an episode, in steps; it may be traced."""
+    return getattr(params, "max_steps_in_episode", DEFAULT_STEP_LIMIT)
+
+
 def parameters_of(env: EnvironmentLike, params: object = None) -> Any:
     """``params``, or the default parameters of ``env`` for None.
 
@@ -30,7 +35,7 @@ def parameters_of(env: EnvironmentLike, params: object = None) -> Any:
     """
     check_switches()
     params = own_parameters(env, params)
-    check_uses(params, DEFAULT_STEP_LIMIT)
+    check_uses(params, step_limit(params))
     base: Any = env
     own = params
     while hasattr(base, "base"):  # the wrapped environment

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rtd3jax.envs.entry import DEFAULT_STEP_LIMIT as DEFAULT_STEP_LIMIT
 from rtd3jax.envs.entry import check_gymnax
 from rtd3jax.errors import UserError, typed_reason
 from rtd3jax.protocols import EnvironmentLike

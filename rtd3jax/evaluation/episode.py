@@ -12,9 +12,8 @@ import numpy as np
 from rtd3jax.envs.compat.simulated import release
 from rtd3jax.envs.description import Drawing
 from rtd3jax.envs.disturbed import Disturbed, seen_elements
-from rtd3jax.envs.entry import parameters_of
+from rtd3jax.envs.entry import parameters_of, step_limit
 from rtd3jax.envs.interface import (
-    DEFAULT_STEP_LIMIT,
     Interface,
     describe,
     environment_name,
@@ -148,7 +147,7 @@ def rollout(
         UserError: for an unsuitable environment or impossible arguments.
     """
     params = parameters_of(env, params)
-    limit = int(getattr(params, "max_steps_in_episode", DEFAULT_STEP_LIMIT))
+    limit = int(step_limit(params))
     steps = limit if steps is None else steps
     check_counts(episodes, seed)
     check_counts(steps, 0, "steps")

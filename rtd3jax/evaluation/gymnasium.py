@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jax.typing import ArrayLike
 
-from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT
+from rtd3jax.envs.entry import DEFAULT_STEP_LIMIT
 from rtd3jax.errors import UserError, short_reason
 from rtd3jax.evaluation.rollout import check_counts
 from rtd3jax.policies.compatibility import check_compatible

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from rtd3jax.envs.disturbed import Disturbed
-from rtd3jax.envs.entry import DEFAULT_STEP_LIMIT, parameters_of
+from rtd3jax.envs.entry import parameters_of, step_limit
 from rtd3jax.envs.interface import Interface, describe, environment_name
 from rtd3jax.envs.processes.impairment import Impairment
 from rtd3jax.envs.processes.process import Process
@@ -63,7 +63,7 @@ class Case:
             fitted(policy, self.interface.action_shape),
             self.observation,
             self.action,
-            getattr(self.params, "max_steps_in_episode", DEFAULT_STEP_LIMIT),
+            step_limit(self.params),
             *self.interface.sizes,
         )
         both = unchecked_returns(played, self.env, episodes, seed, self.params)
@@ -265,7 +265,7 @@ def _with_process(nominal: Case, channel: str, process: Process) -> Case:
             f"{type(process).__name__} changes the number of elements, so no policy could be "
             "tested with and without it"
         )
-    horizon = getattr(nominal.params, "max_steps_in_episode", DEFAULT_STEP_LIMIT)
+    horizon = step_limit(nominal.params)
     if not isinstance(horizon, jax.core.Tracer):
         process.check_use(int(horizon), channel)
     if channel == "observation":

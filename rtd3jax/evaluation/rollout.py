@@ -6,8 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from rtd3jax.envs.compat.simulated import release
-from rtd3jax.envs.entry import parameters_of
-from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT
+from rtd3jax.envs.entry import parameters_of, step_limit
 from rtd3jax.errors import UserError
 from rtd3jax.evaluation.play import begin_episodes, checked, take_step
 from rtd3jax.protocols import EnvironmentLike, PolicyLike
@@ -86,7 +85,7 @@ def episode_returns(
     policy_state, env_state, observation, step_key = begin_episodes(
         policy, env, params, key, episodes
     )
-    limit = getattr(params, "max_steps_in_episode", DEFAULT_STEP_LIMIT)
+    limit = step_limit(params)
     zeros = jnp.zeros((episodes,), jnp.float32)
 
     def unfinished(loop):

@@ -15,10 +15,10 @@ from flax import struct
 from gymnax.environments import environment, spaces
 from jax.typing import ArrayLike
 
+from rtd3jax.envs.compat.elements import kept_elements, time_limit
 from rtd3jax.envs.identity import ValueIdentity, strong
 from rtd3jax.envs.interface import foreign_code
 from rtd3jax.errors import UserError, nearest, typed_reason
-from rtd3jax.system.numbers import is_whole
 
 DEFAULT_EPISODE_LENGTH = 1_000
 """Default time limit in steps, as in Brax and in MuJoCo Playground's control suite."""
@@ -152,7 +152,7 @@ def from_brax(
     *,
     max_steps_in_episode: int | None = None,
     observation_key: str | None = None,
-    keep: Iterable[int] | None = None,
+    keep: Iterable[int] | slice | None = None,
 ) -> BraxEnv:
     """Wrap an environment with Brax's interface as a gymnax environment.
 
@@ -166,7 +166,7 @@ def from_brax(
             environment, or else 1,000.
         observation_key: the key of the observation, if there is a dict of observations; "state" by
             default.
-        keep: indices of the observed elements; all by default.
+        keep: indices of the observed elements, or a slice; all by default.
 
     Raises:
         UserError: if ``env`` is not such an environment, or does not have the indices.
@@ -181,16 +181,12 @@ def from_brax(
                 f"{name} has no {attribute}: it does not have Brax's interface "
                 "(reset(rng), step(state, action), action_size)"
             )
-    length = DEFAULT_EPISODE_LENGTH if max_steps_in_episode is None else max_steps_in_episode
-    if not is_whole(length) or length < 1:
-        raise UserError(f"max_steps_in_episode={length!r} must be an integer of at least 1")
+    length = time_limit(
+        DEFAULT_EPISODE_LENGTH if max_steps_in_episode is None else max_steps_in_episode
+    )
     observation_key, size = _observation(name, _first_state(env, name), observation_key)
-    indices = tuple(range(size)) if keep is None else tuple(int(index) for index in keep)
-    if not indices or len(set(indices)) < len(indices) or not 0 <= min(indices) <= max(indices):
-        raise UserError(f"keep={list(indices)} must be distinct, not negative, at least one")
-    if max(indices) >= size:
-        raise UserError(f"keep={max(indices)} is not in {name}'s observation of size {size}")
-    return BraxEnv(env, BraxParams(int(length)), observation_key, indices)
+    indices = kept_elements(keep, size, name)
+    return BraxEnv(env, BraxParams(length), observation_key, indices)
 
 
 def _truncation(brax: BraxStateLike) -> jax.Array:

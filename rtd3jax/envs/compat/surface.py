@@ -9,9 +9,9 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from rtd3jax.envs.compat.elements import kept_elements, time_limit
 from rtd3jax.envs.entry import DEFAULT_STEP_LIMIT
 from rtd3jax.errors import UserError
-from rtd3jax.system.numbers import is_whole
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -57,6 +57,17 @@ class Surface:
 def surface_of(
     example: gymnasium.Env, title: str, keep: Iterable[int] | slice | None, limit: int | None
 ) -> tuple[Surface, Callable[[Any], np.ndarray]]:
+    """The spaces of a Gymnasium environment, and a function that flattens its observations.
+
+    Args:
+        example: the environment.
+        title: its name, for messages.
+        keep: indices of the observed elements, or a slice; None for all.
+        limit: the time limit in steps; None for the environment's own.
+
+    Raises:
+        UserError: for spaces that an agent cannot use, or for such elements or such a limit.
+    """
     actions, seen = example.action_space, example.observation_space
     if not isinstance(actions, gymnasium.spaces.Box):
         raise UserError(
@@ -69,24 +80,11 @@ def surface_of(
             "gymnasium.wrappers.RescaleAction in a function that makes it"
         )
     names = tuple(_names(seen, "", title))
-    every = range(len(names))
-    indices = (
-        tuple(every)
-        if keep is None
-        else tuple(every[keep])
-        if isinstance(keep, slice)
-        else tuple(int(index) for index in keep)
-    )
-    if not indices or len(set(indices)) < len(indices) or min(indices) < 0:
-        raise UserError(f"keep={keep!r} must name distinct elements, not negative, at least one")
-    if max(indices) >= len(names):
-        raise UserError(f"keep={max(indices)} is not in {title}'s observation of {len(names)}")
+    size = len(names)
+    indices = kept_elements(keep, size, title)
     if limit is None:
         spec = getattr(example, "spec", None)
         limit = getattr(spec, "max_episode_steps", None) or DEFAULT_STEP_LIMIT
-    if not is_whole(limit) or limit < 1:
-        raise UserError(f"max_steps_in_episode={limit!r} must be an integer of at least 1")
-    size = len(names)
 
     def read(observation: object) -> np.ndarray:
         flat = _flat(seen, observation)
@@ -94,7 +92,7 @@ def surface_of(
             raise ValueError(f"it has {flat.size} elements instead of {size}")
         return flat
 
-    return Surface(actions, names, indices, int(limit)), read
+    return Surface(actions, names, indices, time_limit(limit)), read
 
 
 def _names(space: gymnasium.Space, name: str, title: str) -> Iterable[str]:

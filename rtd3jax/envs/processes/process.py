@@ -137,13 +137,11 @@ class Sum(Composition):
         return size
 
 
-def check_uses(params: object, unlimited: int) -> None:
+def check_uses(params: object, horizon: int | jax.Array) -> None:
     """Raise UserError if a process in an environment's parameters cannot act in its episodes.
 
-    ``unlimited`` is the length of an episode if the parameters have no time limit. A traced limit
-    is not checked.
+    ``horizon`` is the time limit of an episode, in steps. A traced limit is not checked.
     """
-    horizon = getattr(params, "max_steps_in_episode", unlimited)
     if isinstance(horizon, jax.core.Tracer) or np.ndim(horizon):
         return
     found = jax.tree_util.tree_leaves_with_path(params, lambda part: isinstance(part, Process))

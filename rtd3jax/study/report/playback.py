@@ -16,7 +16,7 @@ import pandas as pd
 
 from rtd3jax.envs.description import Drawing
 from rtd3jax.envs.disturbed import Disturbed, seen_elements
-from rtd3jax.envs.interface import DEFAULT_STEP_LIMIT
+from rtd3jax.envs.entry import step_limit
 from rtd3jax.envs.registry import description_of
 from rtd3jax.errors import UserError, short_reason
 from rtd3jax.evaluation.episode import element_names, play_episodes
@@ -105,7 +105,7 @@ def _recorded(
     if policy.window_tokens:
         # The same window for all lengths, so that they share a program; a policy keeps its length.
         policy = dataclasses.replace(policy, window_tokens=longest)
-    limit = int(getattr(env.default_params, "max_steps_in_episode", DEFAULT_STEP_LIMIT))
+    limit = int(step_limit(env.default_params))
     drawing = description_of(env, cell.env).drawing or Drawing()
     steps = min(limit, MOST_STEPS)
     try:

@@ -174,6 +174,8 @@ class Failing(Cart):
         (Cart(), {"keep": [2]}, "keep=2 is not in Cart's observation of size 2"),
         (Cart(), {"keep": []}, "at least one"),
         (Cart(), {"keep": [-1]}, "not negative"),
+        (Cart(), {"keep": slice(2, 2)}, "at least one"),
+        (Cart(), {"keep": ["x"]}, "must be a list of indices, or a slice"),
         (Cart(), {"observation_key": "state"}, "leave out observation_key"),
         (Several(), {"observation_key": "pixels"}, "it has privileged_state, state"),
         (Cart(), {"max_steps_in_episode": 0}, "max_steps_in_episode"),

@@ -279,7 +279,7 @@ def test_what_is_refused_in_one_line(given, message):
     assert message in str(raised.value) and "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize("keep", [[], [0, 0], [5], [-1], slice(3, 3)])
+@pytest.mark.parametrize("keep", [[], [0, 0], [5], [-1], [0.5], "ab", 1.5, slice(3, 3)])
 def test_elements_that_cannot_be_kept_are_refused(keep):
     with pytest.raises(rtd.UserError, match="keep="):
         rtd.from_gymnasium(make, keep=keep)
