@@ -16,7 +16,7 @@ import pandas as pd
 
 import rtd3jax as rtd
 from rtd3jax.envs.registry import parse_disturbance
-from rtd3jax.evaluation.rollout import both_returns
+from rtd3jax.evaluation.returns import both_returns
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from writing import RESULTS, markdown_table, parse, provenance, write_results  # noqa: E402

@@ -27,12 +27,12 @@ from rtd3jax.envs.rover.optimum import bayes_policy
 from rtd3jax.envs.stress import Stress
 from rtd3jax.errors import UserError
 from rtd3jax.evaluation.ceiling import ceiling
-from rtd3jax.evaluation.episode import Trajectory, rollout
 from rtd3jax.evaluation.gymnasium import run_in_gymnasium
 from rtd3jax.evaluation.plot import plot_episode
+from rtd3jax.evaluation.returns import evaluate
 from rtd3jax.evaluation.robustness import robustness
 from rtd3jax.evaluation.robustness_plot import plot_robustness
-from rtd3jax.evaluation.rollout import evaluate
+from rtd3jax.evaluation.rollout import Trajectory, rollout
 from rtd3jax.identification.fit import fit_process
 from rtd3jax.identification.result import Estimate, Fit
 from rtd3jax.policies.baselines import constant_policy, random_policy

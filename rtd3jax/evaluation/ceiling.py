@@ -6,7 +6,7 @@ from rtd3jax.envs.description import Ceiling
 from rtd3jax.envs.interface import environment_name
 from rtd3jax.envs.registry import description_of
 from rtd3jax.errors import UserError, short_reason
-from rtd3jax.evaluation.rollout import evaluate
+from rtd3jax.evaluation.returns import evaluate
 from rtd3jax.protocols import EnvironmentLike
 
 

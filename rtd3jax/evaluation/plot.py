@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rtd3jax.errors import UserError
-from rtd3jax.evaluation.episode import Trajectory
+from rtd3jax.evaluation.rollout import Trajectory
 from rtd3jax.evaluation.style import BLACK, GREY, PALETTE, STYLE
 from rtd3jax.system.numbers import is_whole
 

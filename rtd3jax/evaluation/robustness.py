@@ -17,7 +17,7 @@ from rtd3jax.envs.registry import description_of
 from rtd3jax.envs.stress import SIGNAL_STRESSES, Stress
 from rtd3jax.errors import UserError, nearest, short_reason
 from rtd3jax.evaluation.play import check_fits
-from rtd3jax.evaluation.rollout import check_counts, unchecked_returns
+from rtd3jax.evaluation.returns import check_counts, unchecked_returns
 from rtd3jax.policies.compatibility import fitted
 from rtd3jax.policies.impaired import ImpairedPolicy
 from rtd3jax.protocols import EnvironmentLike, PolicyLike

@@ -6,7 +6,7 @@ import time
 import numpy as np
 
 from rtd3jax.errors import short_reason
-from rtd3jax.evaluation.rollout import both_returns
+from rtd3jax.evaluation.returns import both_returns
 from rtd3jax.study.interim import InterimResults
 from rtd3jax.study.log import LOG, append_rows, repair_log
 from rtd3jax.study.loggers import Logger

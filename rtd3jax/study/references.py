@@ -8,7 +8,7 @@ import numpy as np
 from rtd3jax.envs.compat.simulated import is_simulated
 from rtd3jax.envs.registry import description_of
 from rtd3jax.errors import UserError, short_reason
-from rtd3jax.evaluation.rollout import both_returns
+from rtd3jax.evaluation.returns import both_returns
 from rtd3jax.policies.baselines import constant_policy, random_policy
 from rtd3jax.registries import AGENTS
 from rtd3jax.study.derive import Reference

@@ -9,9 +9,9 @@ import numpy as np
 import pandas as pd
 
 from rtd3jax.errors import UserError
+from rtd3jax.evaluation.returns import check_counts
 from rtd3jax.evaluation.robustness import MEASURED, Case, check_policy, make_cases, rows_of
 from rtd3jax.evaluation.robustness_plot import plot_robustness
-from rtd3jax.evaluation.rollout import check_counts
 from rtd3jax.study.colours import ordered
 from rtd3jax.study.lane_files import file_name
 from rtd3jax.study.plan import Cell

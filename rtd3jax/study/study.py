@@ -16,7 +16,7 @@ from pathlib import Path
 import pandas as pd
 
 from rtd3jax.errors import UserError
-from rtd3jax.evaluation.rollout import check_counts
+from rtd3jax.evaluation.returns import check_counts
 from rtd3jax.policies.trained import Policy
 from rtd3jax.study.ceilings import ceilings_of
 from rtd3jax.study.execute import Work

@@ -36,7 +36,7 @@ from rtd3jax.config import Config, traced_fields
 from rtd3jax.envs.compat.simulated import innermost
 from rtd3jax.envs.compat.simulator_state import simulator_state, with_simulator
 from rtd3jax.envs.interface import action_bounds, foreign_code
-from rtd3jax.evaluation.rollout import episode_returns
+from rtd3jax.evaluation.returns import episode_returns
 from rtd3jax.policies.trained import Policy
 from rtd3jax.protocols import EnvironmentLike
 from rtd3jax.training.metrics import (

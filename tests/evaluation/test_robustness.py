@@ -12,8 +12,8 @@ from random_policies import random_policy
 import rtd3jax as rtd
 from rtd3jax.envs.rover import Rover
 from rtd3jax.envs.rover.slip import ConstantSlip
+from rtd3jax.evaluation.returns import _episode_returns
 from rtd3jax.evaluation.robustness import make_cases, stresses_of
-from rtd3jax.evaluation.rollout import _episode_returns
 
 EPISODES, SEED, STEPS = 3, 7, 12
 

@@ -11,7 +11,7 @@ from flax import struct
 import rtd3jax as rtd
 from rtd3jax.envs.builtin import LISTED
 from rtd3jax.envs.processes.process import Process
-from rtd3jax.evaluation import episode, rollout
+from rtd3jax.evaluation import returns, rollout
 from rtd3jax.evaluation.gymnasium import _act
 from rtd3jax.system.pytrees import TypedNode, node_types
 
@@ -114,7 +114,7 @@ def test_policies_with_equal_fields_are_not_taken_for_each_other():
 
 @pytest.mark.parametrize(
     ("module", "program", "play"),
-    [(rollout, "_episode_returns", rtd.evaluate), (episode, "_play", rtd.rollout)],
+    [(returns, "_episode_returns", rtd.evaluate), (rollout, "_play", rtd.rollout)],
 )
 def test_episodes_are_played_by_a_program_for_the_types_of_the_policy(
     module, program, play, monkeypatch

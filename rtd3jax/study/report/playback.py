@@ -19,7 +19,7 @@ from rtd3jax.envs.disturbed import Disturbed, seen_elements
 from rtd3jax.envs.entry import step_limit
 from rtd3jax.envs.registry import description_of
 from rtd3jax.errors import UserError, short_reason
-from rtd3jax.evaluation.episode import element_names, play_episodes
+from rtd3jax.evaluation.rollout import element_names, play_episodes
 from rtd3jax.protocols import EnvironmentLike, PolicyLike
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.report.data import rows_of
