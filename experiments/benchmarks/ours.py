@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import rtd3jax as rtd
-from rtd3jax.training import lanes
+from rtd3jax.training import executables, lanes
 from rtd3jax.training.run import make_jobs
 
 # A measurement ends after the running chunks, and begins with chunks of unknown speed: both must be
@@ -85,7 +85,7 @@ class Lanes:
         program = self.groups[0].jobs[0].program
         return next(
             entry.executables[1].as_text()
-            for (known, *_), entry in lanes._programs.items()
+            for (known, *_), entry in executables._programs.items()
             if known == program and entry.executables is not None
         )
 

@@ -10,6 +10,7 @@ from rtd3jax.envs.entry import parameters_of, step_limit
 from rtd3jax.errors import UserError
 from rtd3jax.evaluation.play import begin_episodes, checked, take_step
 from rtd3jax.protocols import EnvironmentLike, PolicyLike
+from rtd3jax.system.jax_settings import random_key
 from rtd3jax.system.numbers import is_whole
 from rtd3jax.system.program_cache import make_room
 from rtd3jax.system.pytrees import node_types
@@ -70,7 +71,7 @@ def unchecked_returns(
     """As `both_returns`, without checks."""
     make_room()
     types = node_types((policy, params))
-    return _episode_returns(policy, env, params, jax.random.key(seed), episodes, types)
+    return _episode_returns(policy, env, params, random_key(seed), episodes, types)
 
 
 @functools.partial(jax.jit, static_argnames=("env", "episodes", "types"))

@@ -23,6 +23,7 @@ from rtd3jax.envs.registry import description_of
 from rtd3jax.evaluation.play import begin_episodes, checked, take_step
 from rtd3jax.evaluation.returns import check_counts
 from rtd3jax.protocols import EnvironmentLike, PolicyLike
+from rtd3jax.system.jax_settings import random_key
 from rtd3jax.system.program_cache import make_room
 from rtd3jax.system.pytrees import node_types
 
@@ -183,7 +184,7 @@ def play_episodes(
     policy = checked(policy, env, params)
     make_room()
     types = node_types((policy, params))
-    frames = _play(policy, env, params, jax.random.key(seed), episodes, steps, hidden, types)
+    frames = _play(policy, env, params, random_key(seed), episodes, steps, hidden, types)
     return {name: np.asarray(value) for name, value in frames.items()}
 
 

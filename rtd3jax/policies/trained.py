@@ -27,6 +27,9 @@ FORMAT = 2
 
 Actors of format 1 read actions in the environment's units."""
 
+_LONG = 2**30
+"""Steps of an episode after which its counter starts from a small number: 12 days at 1 kHz."""
+
 CARRY_FORMAT = 3
 """Format of saved policies that act with a running carry; otherwise equal to `FORMAT`."""
 
@@ -91,6 +94,11 @@ class Policy:
         return int(self.actor["head"]["bias"].shape[-1])
 
     @property
+    def ring_size(self) -> int:
+        """The number of steps that the state of a window holds."""
+        return max(self.window_tokens, 1)
+
+    @property
     def network(self) -> Network:
         """The actor as a module."""
         sizes = self.observation_size, int(np.prod(self.action_shape, dtype=int))
@@ -104,7 +112,7 @@ class Policy:
         return PolicyState(
             steps=None
             if has_running_carry
-            else empty_steps(max(self.window_tokens, 1), self.observation_size, action_size),
+            else empty_steps(self.ring_size, self.observation_size, action_size),
             previous_action=jnp.zeros((action_size,), jnp.float32),
             time=jnp.int32(0),
             carry=self.network.zero_carry(1) if has_running_carry else None,
@@ -171,7 +179,11 @@ class Policy:
         action = act(self.network, self.actor, window)[0]
         token = action + self.centre_token
         steps = put_step(state.steps, state.time, Steps(observation, state.previous_action, token))
-        state = PolicyState(steps, token, state.time + jnp.int32(1))
+        time = state.time + jnp.int32(1)
+        # Long before int32 overflows, the counter returns to an equal slot of the full ring.
+        whole = _LONG // self.ring_size * self.ring_size - self.ring_size
+        time = jnp.where(time >= _LONG, time - jnp.int32(whole), time)
+        state = PolicyState(steps, token, time)
         return self.bounds.to_environment(action).reshape(self.action_shape), state
 
     def _step_with_carry(

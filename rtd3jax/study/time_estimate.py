@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rtd3jax.config import Config
+from rtd3jax.system.jax_settings import jax_settings, with_settings
 from rtd3jax.training.executables import compiled
 from rtd3jax.training.lanes import Job, stacked, workers
 from rtd3jax.training.loop import Program
@@ -70,13 +71,13 @@ def group_seconds(jobs: Sequence[Job]) -> float:
 def _on_all_workers(jobs: Sequence[Job]) -> list[tuple[float, float]]:
     """For each worker, the seconds of a step with updates, and of an evaluation."""
     devices = workers()
-    together = threading.Barrier(len(devices))
+    together, settings = threading.Barrier(len(devices)), jax_settings()
     found: dict[int, tuple[float, float]] = {}
     errors: list[BaseException] = []
 
     def work(number: int, device: jax.Device) -> None:
         try:
-            with jax.debug_nans(False):
+            with with_settings(settings), jax.debug_nans(False):
                 found[number] = _timed(jobs, device, together)
         except BaseException as error:
             errors.append(error)

@@ -23,6 +23,7 @@ import numpy as np
 
 from rtd3jax.errors import UserError
 from rtd3jax.system.files import read_arrays, write_arrays
+from rtd3jax.system.jax_settings import jax_settings
 from rtd3jax.system.versions import versions_of
 from rtd3jax.training.loop import Lane, LaneState, Program
 from rtd3jax.training.plant import PLANT
@@ -98,6 +99,7 @@ class Checkpoints:
             "step": step,
             "identity": self._identity_of(job),
             "versions": versions(),
+            "settings": dict(jax_settings()),
         }
         file = directory / f"step-{step:09d}.safetensors"
         before = [old for old in checkpoint_files(directory) if old != file]
@@ -203,8 +205,10 @@ class Checkpoints:
             "format": _FORMAT,
             "identity": self._identity_of(job),
             "versions": versions(),
+            "settings": dict(jax_settings()),
         }
-        there = metadata if isinstance(metadata, dict) else {}
+        # Checkpoints of earlier versions do not name the settings of JAX: they had the usual ones.
+        there = {"settings": {}, **(metadata if isinstance(metadata, dict) else {})}
         if PLANT not in (there.get("identity") or {}):
             here["identity"] = {n: x for n, x in here["identity"].items() if n != PLANT}
         longer = is_longer(there.get("identity"), here["identity"])

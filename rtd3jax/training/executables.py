@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from rtd3jax.system.jax_settings import jax_settings
 from rtd3jax.system.program_cache import make_room, on_full
 from rtd3jax.training.loop import Lane, Program
 
@@ -60,7 +61,7 @@ def _remove_programs() -> None:
 
 def compiled(program: Program, lane: Lane, batched: bool, device: jax.Device) -> tuple[Any, Any]:
     """``init`` and ``advance``, compiled once for equal programs."""
-    key = (program, structure_of(lane), batched, device)
+    key = (program, structure_of(lane), batched, device, jax_settings())
     if key not in _programs:
         make_room()
     with _programs_lock:

@@ -23,6 +23,7 @@ from rtd3jax.envs.compat.simulated import fleet_of
 from rtd3jax.envs.compat.simulator_state import simulator_handles
 from rtd3jax.errors import UserError
 from rtd3jax.system.interrupts import patient
+from rtd3jax.system.jax_settings import Settings, jax_settings, with_settings
 from rtd3jax.system.machine import cores
 from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.executables import compiled, structure_of
@@ -208,9 +209,9 @@ def advance_groups(
     If a checkpoint cannot be written then, the others are written before the error is raised.
     ``devices`` has a device for each worker, by default those of `workers`.
     """
-    pool = _Pool(groups)
+    pool, settings = _Pool(groups), jax_settings()
     threads = [
-        threading.Thread(target=_work, args=(pool, device, checkpoints), daemon=True)
+        threading.Thread(target=_work, args=(pool, device, checkpoints, settings), daemon=True)
         for device in (workers() if devices is None else devices)[: max(1, len(groups))]
     ]
     try:
@@ -323,10 +324,12 @@ class _Pool:
             self._changed.notify_all()
 
 
-def _work(pool: _Pool, device: jax.Device, checkpoints: Checkpoints | None) -> None:
+def _work(
+    pool: _Pool, device: jax.Device, checkpoints: Checkpoints | None, settings: Settings
+) -> None:
     """The worker of a device."""
     # jax_debug_nans must be off: points of curves that are not reached yet are NaN.
-    with jax.debug_nans(False):
+    with with_settings(settings), jax.debug_nans(False):
         _train(pool, device, checkpoints)
 
 

@@ -39,6 +39,7 @@ from rtd3jax.envs.interface import action_bounds, foreign_code
 from rtd3jax.evaluation.returns import episode_returns
 from rtd3jax.policies.trained import Policy
 from rtd3jax.protocols import EnvironmentLike
+from rtd3jax.system.jax_settings import random_key
 from rtd3jax.training.metrics import (
     Averages,
     averaged,
@@ -151,7 +152,7 @@ class Program:
 
     def init(self, lane: Lane) -> LaneState:
         """The lane before its first step."""
-        key = jax.random.key(lane.seed)
+        key = random_key(lane.seed)
         observation, env_state = self._reset(jax.random.fold_in(key, _RESET), lane)
         count = self.config.environments
         return LaneState(
@@ -204,7 +205,7 @@ class Program:
 
     def _step(self, lane: Lane, state: LaneState, step: jax.Array) -> LaneState:
         hyperparameters = lane.hyperparameters
-        root = jax.random.key(lane.seed)
+        root = random_key(lane.seed)
         act_key, learn_key, env_key = jax.random.split(
             jax.random.fold_in(jax.random.fold_in(root, _STEPS), step), 3
         )
@@ -418,7 +419,7 @@ class Program:
 
         def evaluate(curves):
             returns, true_returns, metrics = curves
-            key = jax.random.fold_in(jax.random.key(lane.seed), _EVALUATION)
+            key = jax.random.fold_in(random_key(lane.seed), _EVALUATION)
             policy = self.policy(lane, state)
             totals = episode_returns(
                 policy,
@@ -452,7 +453,7 @@ def revived(program: Program, lane: Lane, state: LaneState, step: int) -> LaneSt
     if found is not None:
         there = with_simulator(state.env_state, found)
         return dataclasses.replace(state, env_state=there)
-    root = jax.random.key(lane.seed)
+    root = random_key(lane.seed)
     key = jax.random.fold_in(jax.random.fold_in(root, _REVIVED), step)
     observation, env_state = program._reset(key, lane)
     state = jax.jit(program.cut)(lane, state, jnp.int32(step // program.config.environments))

@@ -209,16 +209,25 @@ def train(
         number = "" if single else f" {job.cell}"
         return f"{own.algorithm} l={own.history_length}{number}"
 
+    lanes: dict[tuple[Any, int], tuple[Job, LaneState]] = {}
     with Progress(groups, label, enabled=progress, remark=remark) as bar:
 
         def on_chunk(group: Group) -> None:
             bar.update(group)
+            # An event may arrive after the one at which the group was collected.
+            if not group.finished or group.error is not None or group.state is None:
+                return
             # Other lanes may train for hours before this call ends.
-            if checkpoints is not None and group.finished and group.error is None:
+            if checkpoints is not None:
                 checkpoints.save_once(group)
+            for job, state in group.lanes():
+                lanes[job.key] = job, _without_replay(state)
+            group.state = None
 
         advance_groups(groups, on_chunk, checkpoints)
-    lanes = _ended(groups)
+    for group in groups:
+        if group.error is not None:
+            raise group.error
     runs = [
         collect(one, seeds, {seed: lanes[index, seed] for seed in seeds})
         for index, one in enumerate(configs)
@@ -243,14 +252,10 @@ def _checkpoints(
     return Checkpoints(lambda job: directories[job.cell] / f"seed-{job.seed}", identity, seconds)
 
 
-def _ended(groups: Iterable[Group]) -> dict[tuple[Any, int], tuple[Job, LaneState]]:
-    """The lanes of groups that have ended, by key; raises the error of a group that failed."""
-    found: dict[tuple[Any, int], tuple[Job, LaneState]] = {}
-    for group in groups:
-        if group.error is not None:
-            raise group.error
-        found.update({job.key: (job, state) for job, state in group.lanes()})
-    return found
+def _without_replay(state: LaneState) -> LaneState:
+    """The state of a lane that has ended; its replay takes most of the memory."""
+    nothing: Any = None
+    return dataclasses.replace(state, replay=nothing)
 
 
 def _horizon(params: Any) -> int | None:

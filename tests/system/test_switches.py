@@ -1,5 +1,6 @@
 """Tests of JAX's switches: each works, or is refused with one line."""
 
+import dataclasses
 import os
 import subprocess
 import sys
@@ -11,6 +12,7 @@ import pytest
 
 import rtd3jax as rtd
 from rtd3jax.envs.interface import foreign_code
+from rtd3jax.training import executables
 from rtd3jax.training.run import make_jobs
 
 WORKING = [
@@ -20,6 +22,15 @@ WORKING = [
     *("JAX_DEFAULT_PRNG_IMPL=rbg", "JAX_THREEFRY_PARTITIONABLE=0", "JAX_LOG_COMPILES=1"),
     *("JAX_EXPLAIN_CACHE_MISSES=1", "JAX_PLATFORMS=cpu", "JAX_DEFAULT_DEVICE=cpu"),
 ]
+
+TINY = dict(
+    total_steps=40,
+    hidden_size=4,
+    batch_size=4,
+    learning_starts=10,
+    eval_every=20,
+    eval_episodes=1,
+)
 
 EVERYTHING = """
 import sys
@@ -132,3 +143,59 @@ def test_without_jit_an_environment_can_be_looked_into_and_not_trained_on():
             rtd.train(env, rtd.Config("td3"), [0])
         looked_into = rtd.evaluate(rtd.random_policy(env), env, episodes=2)
     np.testing.assert_allclose(looked_into, compiled, rtol=1e-5)
+
+
+def lowered(program, lane):
+    state = jax.eval_shape(program.init, lane)
+    step = jnp.int32(0)
+    return jax.jit(program.advance).lower(lane, state, step, step).as_text()
+
+
+def test_a_context_of_the_caller_reaches_the_threads_that_compile(monkeypatch):
+    """JAX's contexts act in one thread only; executables of other settings are not used."""
+    seen, real = [], executables._compile
+
+    def compiled(program, lane, batched, device):
+        seen.append("HIGHEST" in lowered(program, lane))
+        return real(program, lane, batched, device)
+
+    monkeypatch.setattr(executables, "_programs", {})
+    monkeypatch.setattr(executables, "_compile", compiled)
+    env, config = rtd.make("rover", "ar1-slip"), rtd.Config("td3", **TINY)
+
+    def train():
+        return rtd.train(env, config, [0], progress=False).returns
+
+    plain = train()
+    with jax.default_matmul_precision("highest"):
+        train()
+    np.testing.assert_array_equal(train(), plain)
+    assert seen == [False, True]
+
+
+def test_a_generator_that_depends_on_the_company_of_a_lane_is_not_used():
+    env, config = rtd.make("rover", "ar1-slip"), rtd.Config("td3", **TINY)
+
+    def train(seeds):
+        return rtd.train(env, config, seeds, progress=False, strategy="vmap").returns
+
+    usual = train([0, 1, 2])
+    with jax.default_prng_impl("unsafe_rbg"):
+        np.testing.assert_allclose(train([2, 0, 1])[[1, 2, 0]], usual, rtol=1e-5)
+        policy = rtd.random_policy(env)
+        returns = rtd.evaluate(policy, env, episodes=3)
+    np.testing.assert_array_equal(rtd.evaluate(policy, env, episodes=3), returns)
+
+
+def test_a_training_does_not_continue_with_other_settings(tmp_path, monkeypatch):
+    env, config = rtd.make("rover", "ar1-slip"), rtd.Config("td3", **TINY)
+
+    def train(steps):
+        longer = dataclasses.replace(config, total_steps=steps)
+        return rtd.train(env, longer, [0], progress=False, checkpoint_dir=tmp_path)
+
+    train(40)
+    with jax.threefry_partitionable(False), pytest.raises(rtd.UserError) as raised:
+        train(80)
+    assert "settings (jax_threefry_partitionable: None there, False here)" in str(raised.value)
+    assert not train(80).failures
