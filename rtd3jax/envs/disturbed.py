@@ -1,6 +1,7 @@
 """An environment whose observation, action or reward a process disturbs (paper, Section 5.2)."""
 
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -132,18 +133,18 @@ class Disturbed(ValueIdentity, environment.Environment):
         self, key: jax.Array, params: DisturbedParams
     ) -> tuple[jax.Array, DisturbedState]:
         """Start an episode and all processes; returns the first observation [O] and the state."""
-        key_env, _, _ = jax.random.split(key, 3)
+        key_env, *keys = jax.random.split(key, 3)
         with foreign_code():
             first, env = self.base.reset_env(key_env, params.env)
-        return self._begin_episode(key, jnp.asarray(first, jnp.float32), env, params)
+        return self._begin_episode(keys, jnp.asarray(first, jnp.float32), env, params)
 
     def reset_where(
         self, where: jax.Array, key: jax.Array, state: DisturbedState, params: DisturbedParams
     ) -> tuple[jax.Array, DisturbedState]:
         """As `reset_env`, for a simulator, which is reset only if ``where`` is true."""
-        key_env, _, _ = jax.random.split(key, 3)
+        key_env, *keys = jax.random.split(key, 3)
         first, env = self.base.reset_where(where, key_env, state.env, params.env)
-        return self._begin_episode(key, first, env, params)
+        return self._begin_episode(keys, first, env, params)
 
     def step(
         self, key: jax.Array, state: object, action: ArrayLike, params: object = None
@@ -155,10 +156,14 @@ class Disturbed(ValueIdentity, environment.Environment):
         return step_with_reset(self, key, state, action, params)
 
     def _begin_episode(
-        self, key: jax.Array, true_observation: jax.Array, env: object, params: DisturbedParams
+        self,
+        keys: Sequence[jax.Array],
+        true_observation: jax.Array,
+        env: object,
+        params: DisturbedParams,
     ) -> tuple[jax.Array, DisturbedState]:
         """The first observation and state, from those of the wrapped environment."""
-        _, key_init, key_process = jax.random.split(key, 3)
+        key_init, key_process = keys
         with foreign_code():
             actions = _action_size(self.base, params.env)
         (full,) = true_observation.shape

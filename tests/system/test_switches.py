@@ -199,3 +199,13 @@ def test_a_training_does_not_continue_with_other_settings(tmp_path, monkeypatch)
         train(80)
     assert "settings (jax_threefry_partitionable: None there, False here)" in str(raised.value)
     assert not train(80).failures
+
+
+@pytest.mark.parametrize("env_id", rtd.ENVIRONMENTS)
+def test_no_environment_uses_a_key_twice(env_id):
+    for disturbance in rtd.DISTURBANCES[env_id][:4]:
+        env, key = rtd.make(env_id, disturbance), jax.random.key(0)
+        action = jnp.zeros(env.num_actions, jnp.float32)
+        with jax.debug_key_reuse(True):
+            _, state = jax.jit(env.reset)(key, env.default_params)
+            jax.jit(env.step)(jax.random.key(1), state, action, env.default_params)
