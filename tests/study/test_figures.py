@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from rtd3jax.registries import AGENTS
+from rtd3jax.agents.variants import ALGORITHMS
 from rtd3jax.study import figures
 from rtd3jax.study.colours import colour_of
 from rtd3jax.study.statistics import summarise
@@ -133,7 +133,7 @@ def test_each_panel_shows_its_own_history_length(tmp_path, drawn):
 
 
 def test_each_algorithm_has_its_own_colour():
-    agents = (*AGENTS, "another")
+    agents = (*ALGORITHMS, "lstm-td3-privileged", "another")
     for on_dark in (False, True):
         assert len({colour_of(name, on_dark=on_dark) for name in agents}) == len(agents)
 
