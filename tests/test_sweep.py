@@ -99,6 +99,8 @@ def test_a_lost_lane_is_reported_and_the_exit_status_says_so(tmp_path, capsys):
     assert sweep.main(arguments) == 1
     captured = capsys.readouterr()
     assert "lost at step" in captured.err and "lower actor_learning_rate" in captured.out
+    assert sweep.main(arguments) == 1  # also if nothing is trained again
+    assert "lanes were lost or failed before: --status says why" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

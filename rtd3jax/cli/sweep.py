@@ -227,7 +227,14 @@ def _conclude(directory: RunDirectory, complaints: Sequence[str], interrupted: i
         return interrupted
     for line in complaints:
         print(line, file=sys.stderr)
-    return 1 if complaints else 0
+    ended_badly = sum(row["status"] in ("lost", "failed") for row in ledger(directory))
+    if ended_badly and not complaints:
+        print(
+            f"{ended_badly} lanes were lost or failed before: --status says why; remove the files "
+            f"of lost lanes from {directory.path / 'lanes'} to train them again",
+            file=sys.stderr,
+        )
+    return 1 if complaints or ended_badly else 0
 
 
 def _set_aside(out: Path) -> None:

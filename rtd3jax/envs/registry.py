@@ -112,8 +112,11 @@ def make(env_id: str, disturbance: str = "none", **parameters: Any) -> Any:
     if entry is None and env_id.startswith(PREFIX):
         entry = _Entry(from_gymnasium(env_id.removeprefix(PREFIX)), None, _NONE, "gymnasium")
     if entry is None:
-        known = (*_entries, *gymnax.registered_envs)
-        raise UserError(f"unknown environment {env_id!r}{nearest(env_id, known)}")
+        hint = nearest(env_id, (*_entries, *gymnax.registered_envs))
+        raise UserError(
+            f"unknown environment {env_id!r}"
+            f"{hint or '; import the module that registers it (--import in a command)'}"
+        )
     if entry.construct is not None:
         return entry.construct(disturbance, **parameters)
     return _disturbed(env_id, entry, disturbance, parameters)
