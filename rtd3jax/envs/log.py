@@ -117,6 +117,8 @@ def _episodes_of_table(
                 f"{what} has no column {name!r}{nearest(str(name), there)} "
                 f"(it has: {', '.join(there)})"
             )
+    if table.empty and chosen:
+        raise UserError(f"{what} has no row with a number in every column")
     if not chosen:
         raise UserError(f"{what} has no column besides the episode's (it has: {', '.join(there)})")
     numbers = [_numbers(what, name, table[name]) for name in chosen]

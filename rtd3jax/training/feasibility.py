@@ -24,6 +24,8 @@ def why_untrained(config: Config) -> str | None:
     """Why a configuration will not train its networks, and what to change; None if it will."""
     critics, actor = updates_of(config)
     end = "the actor will not change"
+    if {"actor", "critics"} <= set(config.frozen):
+        return "freeze names the actor and the critics, so nothing will change: leave out one"
     if critics == 0:
         starts = config.first_learning_step * config.environments
         rounded = f", which becomes {starts:,}" if starts != config.learning_starts else ""

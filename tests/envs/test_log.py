@@ -62,6 +62,7 @@ def test_another_rate_is_interpolated_within_each_stretch():
         ),
         ("left,right\n1,2\n", {"episode": "run"}, r"no column 'run' \(it has: left, right\)"),
         ("episode\n1\n", {}, "no column besides the episode"),
+        ("episode,a\n", {}, "has no row"),
         ("episode,a\n1,0\n2,0\n1,0\n", {}, "episode 1 continues in row 2, after rows of another"),
         ("episode,a\n1,0\n,0\n", {}, "has empty rows"),
         ("a\n1\ninf\n", {}, "is infinite in row 1"),

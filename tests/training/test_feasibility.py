@@ -37,6 +37,7 @@ def config(**changes):
         ({"critic_learning_rate": 0}, "critic_learning_rate is 0"),
         ({"tau": 0}, "tau is 0, so the target networks"),
         ({"reward_scale": 0}, "all rewards in updates will be 0"),
+        ({"freeze": "actor,critics"}, "freeze names the actor and the critics"),
     ],
 )
 def test_it_is_said(changes, match):
