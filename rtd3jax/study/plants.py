@@ -1,16 +1,27 @@
 """The plants of a study: the same name must mean the same plant as long as the study grows."""
 
+import hashlib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+
+from rtd3jax.envs.compat.simulated import is_simulated
+from rtd3jax.envs.interface import describe, foreign_code
 from rtd3jax.errors import UserError
+from rtd3jax.protocols import EnvironmentLike
 from rtd3jax.study.plan import Cell
+from rtd3jax.system.jax_settings import random_key, with_settings
 from rtd3jax.training.checkpoint import difference, same
 from rtd3jax.training.plant import plant_of
 
 Plants = dict[str, dict[str, Any]]
 """The identity of each pair of an environment and a disturbance, by `plant_name`."""
+
+CODE = "code"
+"""Part of an identity: what its environment computes."""
 
 
 def plants_of(cells: Iterable[Cell]) -> Plants:
@@ -24,20 +35,78 @@ def plant_name(cell: Cell) -> str:
     return f"{cell.env} {cell.disturbance}"
 
 
-def check_plants(path: Path, before: Plants, now: Plants) -> None:
-    """Raise UserError if a plant of the study in ``path`` is another one now.
+def check_plants(path: Path, before: Plants, now: Plants) -> list[str]:
+    """Compare the plants of the study in ``path`` with those of the same names now.
 
-    A study of an earlier version does not state its plants, which then count as the same.
+    Studies of earlier versions state fewer parts of their plants, or none; parts that are not
+    stated count as the same.
+
+    Returns:
+        A line for each plant whose code computes something else now. Only its author can know
+        whether this changes results.
+
+    Raises:
+        UserError: if a plant has other parameters, options, sizes or bounds now.
     """
+    lines = []
     for name, plant in now.items():
-        if name in before and not same(before[name], plant):
+        there = before.get(name, {})
+        here = {part: plant[part] for part in plant if part in there and part != CODE}
+        was = {part: there[part] for part in here}
+        if not same(was, here):
             raise UserError(
-                f"--out {path} holds lanes of another plant with the name {name} "
-                f"({difference(before[name], plant)}): choose another directory, or register the "
+                f"{path} holds lanes of another plant with the name {name} "
+                f"({difference(was, here)}): choose another directory, or register the "
                 "changed plant under another name"
             )
+        if _is_other_code(there.get(CODE), plant[CODE]):
+            lines.append(
+                f"warning: the code of {name} computes something else now than when {path} was "
+                "begun, so one table can show results of two plants: choose another directory "
+                "unless the change does not matter"
+            )
+    return lines
 
 
 def _made(cell: Cell) -> dict[str, Any]:
     env = cell.make_env()
-    return plant_of(env, env.default_params)
+    params = env.default_params
+    interface = describe(env, params)
+    return {
+        **plant_of(env, params),
+        "observation": interface.observation_size,
+        "actions": [interface.action_low.tolist(), interface.action_high.tolist()],
+        CODE: _code_of(env, params),
+    }
+
+
+def _is_other_code(before: dict[str, str] | None, now: dict[str, str] | None) -> bool:
+    """Whether two codes differ; another version of JAX may write the same code differently."""
+    if before is None or now is None or before["jax"] != now["jax"]:
+        return False
+    return before["sha256"] != now["sha256"]
+
+
+def _code_of(env: EnvironmentLike, params: object) -> dict[str, str] | None:
+    """A digest of the operations of reset and step, without the numbers of the parameters.
+
+    Nothing is compiled. None for an environment that calls Python while it runs, of which the
+    digest would not contain all and would differ in every process.
+    """
+    if is_simulated(env):
+        return None
+
+    def both(key: jax.Array, state: object, action: jax.Array, params: object) -> tuple:
+        return env.reset(key, params), env.step(key, state, action, params)
+
+    shape = env.action_space(params).shape
+    # The text must not depend on the settings of the process, nor on its devices.
+    with with_settings(()), foreign_code():
+        key = random_key(0)
+        state = jax.eval_shape(env.reset, key, params)[1]
+        action = jax.ShapeDtypeStruct(shape, jnp.float32)
+        traced = jax.jit(both).trace(key, state, action, params)
+        text = traced.lower(lowering_platforms=("cpu",)).as_text()
+    if "callback" in text:
+        return None
+    return {"jax": jax.__version__, "sha256": hashlib.sha256(text.encode()).hexdigest()}

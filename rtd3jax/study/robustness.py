@@ -15,9 +15,10 @@ from rtd3jax.evaluation.robustness_plot import plot_robustness
 from rtd3jax.study.colours import ordered
 from rtd3jax.study.lane_files import file_name
 from rtd3jax.study.plan import Cell
+from rtd3jax.study.plants import plants_of
 from rtd3jax.study.results import CELL, LANE
 from rtd3jax.study.rundir import RunDirectory
-from rtd3jax.system.files import write_bytes_atomically
+from rtd3jax.system.files import check_writable, write_bytes_atomically
 
 FILE = "robustness.parquet"
 COLUMNS = (*CELL, "seed", *MEASURED)
@@ -38,12 +39,15 @@ def run_robustness(
             default. In a run of several environments, a stress may be unknown to some of them.
         episodes: number of episodes for each policy and value. The seed of a lane is also the seed
             of its episodes, so agents with the same seed meet the same episodes.
-        say: receives a line if a stress does not fit an environment, or a lane has no policy.
+        say: receives a line if a stress does not fit an environment, a lane has no policy, or the
+            code of a plant has changed since the study began.
 
     Raises:
-        UserError: for an unknown stress or an impossible value, or when nothing is trained yet.
+        UserError: for an unknown stress or an impossible value, when nothing is trained yet, when
+            a plant is not the one of the study, or when the table could not be written.
     """
     check_counts(episodes, 0)
+    check_writable(directory.path)
     lanes = [
         (cell, seed)
         for cell in directory.cells
@@ -54,6 +58,8 @@ def run_robustness(
         raise UserError(
             f"{directory.path} has no finished lane that could be tested: --status prints the lanes"
         )
+    for line in directory.check_plants(plants_of(cell for cell, _ in lanes)):
+        say(line)
     cases = _all_cases([cell for cell, _ in lanes], stresses, say)
     rows: list[dict[str, Any]] = []
     for cell, seed in lanes:

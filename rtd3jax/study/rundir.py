@@ -103,8 +103,8 @@ class RunDirectory:
         """Determine the contents of the study, without writing anything.
 
         Returns:
-            A message about additions, or about cells and seeds that this sweep does not name; it
-            is usually empty.
+            A message about plants whose code has changed, about additions, or about cells and
+            seeds that this sweep does not name; it is usually empty.
         """
         config = self.path / CONFIG
         if not config.exists():
@@ -118,18 +118,22 @@ class RunDirectory:
                 f"--out {self.path} holds another study ({error}); "
                 "choose another directory, or remove that one"
             ) from error
-        check_plants(self.path, read_config(config).get("plants", {}), self._plants())
+        news = self.check_plants(self._plants())
         self._check_longer(there)
         self._check_format(config)
         if self.contents != there:
             check_names(self.cells)
-            return f"added to {self.path}: {additions_text(there, self.contents)}"
-        if extended(self._asked, there) != self._asked:
-            return (
+            news.append(f"added to {self.path}: {additions_text(there, self.contents)}")
+        elif extended(self._asked, there) != self._asked:
+            news.append(
                 f"{self.path} holds more cells or seeds than this command names: all of its "
                 f"{len(there.cells)} cells × {len(there.seeds)} seeds are continued"
             )
-        return ""
+        return "\n".join(news)
+
+    def check_plants(self, now: Plants) -> list[str]:
+        """Lines about changed plants of this study; `rtd3jax.study.plants.check_plants`."""
+        return check_plants(self.path, read_config(self.path / CONFIG).get("plants", {}), now)
 
     def prepare(self) -> str:
         """Create the directory, or extend its study; return the message of `plan`.

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from rtd3jax.envs.registry import make, parse_disturbance
 from rtd3jax.errors import UserError
 from rtd3jax.evaluation.returns import both_returns
 from rtd3jax.study.plan import Cell
+from rtd3jax.study.plants import plants_of
 from rtd3jax.study.results import LANE
 from rtd3jax.study.rundir import RunDirectory
-from rtd3jax.system.files import write_bytes_atomically
+from rtd3jax.system.files import check_writable, write_bytes_atomically
 
 FILE = "transfer.parquet"
 CELL = ["env", "algorithm", "history_length", "trained_on", "tested_on"]
@@ -39,11 +39,15 @@ def transfer(
             seed of its episodes, so agents with the same seed meet the same episodes.
         cells: cells whose policies are tested; all cells by default.
         write: whether to write the table to the run directory.
-        say: receives a line if a disturbance does not fit some policies.
+        say: receives a line if a disturbance does not fit some policies, or the code of a plant has
+            changed since the study began.
 
     Raises:
-        UserError: for an unknown disturbance, or when nothing is trained yet.
+        UserError: for an unknown disturbance, when nothing is trained yet, when no plant is the one
+            of the study, or when the table could not be written.
     """
+    if write:
+        check_writable(directory.path)
     rows: list[dict[str, Any]] = []
     environments: dict[tuple[str, str], Any] = {}
     problems: dict[tuple[str, str, str], int] = {}
@@ -57,8 +61,10 @@ def transfer(
             for seed in directory.seeds:
                 try:
                     if environment not in environments:
-                        name, parameters = parse_disturbance(disturbance)
-                        environments[environment] = make(cell.env, name, **parameters)
+                        world = Cell(cell.env, disturbance, cell.config)
+                        for line in directory.check_plants(plants_of([world])):
+                            say(line)
+                        environments[environment] = world.make_env()
                     if not directory.lanes.is_done(cell, seed):
                         continue
                     both = both_returns(

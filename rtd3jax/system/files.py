@@ -66,6 +66,12 @@ def check_target(path: str | os.PathLike, overwrite: bool = False) -> Path:
     return path
 
 
+def check_writable(directory: Path) -> None:
+    """Raise UserError if no file can be written to the directory, before hours of work for it."""
+    if not os.access(directory, os.W_OK | os.X_OK):
+        raise UserError(f"{directory} cannot be written: it is read-only for this user")
+
+
 def write_new(path: str | os.PathLike, data: bytes, overwrite: bool = False) -> None:
     """Write ``data`` to ``path``; an existing file is replaced only with ``overwrite``.
 

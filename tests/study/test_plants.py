@@ -1,6 +1,7 @@
 """Tests that a study does not mix different plants of the same name."""
 
 import json
+import os
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,9 @@ from gymnax.environments import environment, spaces
 
 import rtd3jax as rtd
 from rtd3jax.study.plan import Cell
+from rtd3jax.study.robustness import run_robustness
 from rtd3jax.study.rundir import RunDirectory
+from rtd3jax.study.transfer import transfer
 
 
 @struct.dataclass
@@ -73,6 +76,89 @@ def test_what_was_added_is_held_too(tmp_path):
     study(tmp_path, 0.08, ("none",), noise=0.3)  # which that plant does not have
 
 
+def register_changed(**changes):
+    """Register the tank again, with other methods: another class of the same name."""
+    changed = type("Tank", (Tank,), changes)
+    rtd.register("tank-of-a-study", changed(), {"noisy": rtd.GaussianNoise(0.1)}, replace=True)
+
+
+def other_reward(self, key, state, action, params):
+    obs, state, _, terminated, info = Tank.step_env(self, key, state, action, params)
+    return obs, state, -jnp.abs(obs[0]), terminated, info
+
+
+def plan_now(path, disturbances=("none",)):
+    config = rtd.Config("td3", total_steps=200)
+    cells = [Cell("tank-of-a-study", name, config) for name in disturbances]
+    return RunDirectory(path, cells, [0], 2).plan()
+
+
+def test_other_code_of_a_plant_is_noticed(tmp_path):
+    study(tmp_path, 0.08, ("none", "noisy"))
+    assert plan_now(tmp_path, ("none", "noisy")) == ""
+    register_changed()  # the same code in another class
+    assert plan_now(tmp_path, ("none", "noisy")) == ""
+    register_changed(step_env=other_reward)
+    news = plan_now(tmp_path, ("none", "noisy")).splitlines()
+    assert len(news) == 2
+    assert all(
+        f"the code of tank-of-a-study {name} computes" in line
+        for name, line in zip(("none", "noisy"), news, strict=True)
+    )
+
+
+def test_code_is_compared_only_as_one_version_of_jax_writes_it(tmp_path):
+    study(tmp_path, 0.08)
+    register_changed(step_env=other_reward)
+    file = tmp_path / "config.json"
+    content = json.loads(file.read_text())
+    content["plants"]["tank-of-a-study none"]["code"]["jax"] = "0.0.1"
+    file.write_text(json.dumps(content))
+    assert plan_now(tmp_path) == ""
+
+
+def test_the_numbers_and_settings_of_a_process_are_not_code(tmp_path):
+    study(tmp_path, 0.08)
+    with jax.default_matmul_precision("float32"), jax.enable_x64(True):
+        assert plan_now(tmp_path) == ""
+
+
+def test_other_bounds_of_actions_make_another_plant(tmp_path):
+    study(tmp_path, 0.08)
+    register_changed(action_space=lambda self, params: spaces.Box(-2.0, 1.0, (1,)))
+    with pytest.raises(rtd.UserError, match=r"another plant .* \(actions: .*-1.0.*-2.0"):
+        plan_now(tmp_path)
+
+
+def test_a_plant_that_calls_python_has_no_code_to_compare(tmp_path):
+    def calls_back(self, key, state, action, params):
+        jax.debug.callback(lambda level: None, action[0])
+        return Tank.step_env(self, key, state, action, params)
+
+    register_changed(step_env=calls_back)
+    config = rtd.Config("td3", total_steps=200)
+    RunDirectory.create(tmp_path, [Cell("tank-of-a-study", "none", config)], [0], 2)
+    plants = json.loads((tmp_path / "config.json").read_text())["plants"]
+    assert plants["tank-of-a-study none"]["code"] is None
+    assert plan_now(tmp_path) == ""
+
+
+@pytest.mark.parametrize("test", (transfer, run_robustness))
+def test_trained_agents_are_tested_only_on_the_plant_of_their_study(tmp_path, test):
+    register_changed()
+    cell = Cell("tank-of-a-study", "none", rtd.Config("td3", total_steps=200))
+    rtd.Study([cell], seeds=[0], out=tmp_path, final_episodes=2).run(quiet=True, page=False)
+    directory, lines = RunDirectory.open(tmp_path), []
+    test(directory, None, 2, lines.append)
+    assert not any("computes something else" in line for line in lines)
+    register_changed(step_env=other_reward)
+    test(directory, None, 2, lines.append)
+    assert sum("computes something else" in line for line in lines) == 1
+    rtd.register("tank-of-a-study", Tank(0.02), replace=True)
+    with pytest.raises(rtd.UserError, match="another plant"):
+        test(directory, None, 2, lines.append)
+
+
 def test_a_study_without_its_plants_goes_on_and_states_those_that_are_added(tmp_path):
     study(tmp_path, 0.08)
     file = tmp_path / "config.json"
@@ -96,3 +182,11 @@ def test_a_plant_is_the_same_in_every_process():
     assert one == other and " at 0x" not in one
     params = jax.tree.map(jnp.asarray, env.default_params)
     assert plant_of(env, params)["env"] == plant_of(env, env.default_params)["env"]
+
+
+@pytest.mark.parametrize("test", (transfer, run_robustness))
+def test_a_read_only_study_is_refused_before_anything_is_played(tmp_path, test, monkeypatch):
+    study(tmp_path, 0.08)
+    monkeypatch.setattr(os, "access", lambda *_: False)  # the superuser may write everywhere
+    with pytest.raises(rtd.UserError, match="cannot be written"):
+        test(RunDirectory.open(tmp_path), None, 2)
