@@ -21,7 +21,7 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 from rtd3jax.evaluation.style import STYLE
 from rtd3jax.study.colours import colour_of, ordered
 from rtd3jax.study.results import is_trained, reference_names
-from rtd3jax.study.statistics import iqm_bands, seed_means, summarise
+from rtd3jax.study.statistics import iqm_bands, reference_mean, seed_means, summarise
 from rtd3jax.system.files import write_bytes_atomically
 
 REFERENCE_COLOUR = "#777777"
@@ -279,16 +279,15 @@ def _fit(axes: Axes, values: Iterable[float], references: dict[str, float]) -> N
 def _reference_means(
     episodes: pd.DataFrame | None, ceilings: Ceilings | None, task: tuple[str, str]
 ) -> dict[str, float]:
-    """Mean return of each reference policy over all finite episodes, and the return's ceiling."""
+    """Mean return of each reference policy that has one, and the return's ceiling."""
     means = {}
     if episodes is not None:
         rows = _of_task(episodes, task)
         rows = rows[~is_trained(rows)]
         for name in reference_names(rows):
-            values = rows.loc[rows["algorithm"] == name, "return"].to_numpy(np.float64)
-            values = values[np.isfinite(values)]
-            if values.size:
-                means[name] = float(values.mean())
+            mean = reference_mean(rows.loc[rows["algorithm"] == name, "return"])
+            if math.isfinite(mean):
+                means[name] = mean
     best = (ceilings or {}).get(task, {})
     if best.get("mean") is not None and best["measure"] == "return":
         means["ceiling" if best["kind"] == "exact" else "upper bound"] = best["mean"]

@@ -51,6 +51,14 @@ def seed_means(episodes: pd.DataFrame) -> pd.DataFrame:
     return grouped[["return", "true_return"]].mean(skipna=False)
 
 
+def reference_mean(returns: pd.Series) -> float:
+    """Mean over the episodes of a policy that was not trained; NaN if one has no number.
+
+    As for a lane, the mean of its other episodes would be too high.
+    """
+    return float(returns.astype(np.float64).mean(skipna=False))
+
+
 def summarise(values: ArrayLike) -> Summary:
     """Summarise ``values`` [seeds], one number per seed; NaN and infinity mark a failed seed.
 

@@ -48,6 +48,8 @@ def summary_markdown(
     if not tasks:
         lines += ["No results.", ""]
     lines += ["## Lanes lost", ""] + _failure_lines(failures)
+    if diverged := _diverged_lines(episodes[is_trained(episodes)]):
+        lines += ["", "## Lanes without a mean return", "", *diverged]
     return "\n".join(lines) + "\n"
 
 
@@ -92,8 +94,8 @@ def _task_section(
     references = references[~is_trained(references)]
     for name in reference_names(references):
         played = references[references["algorithm"] == name]
-        entries = [f"{name} (reference)", "–", "–", _spread(summarise(played["return"])), "–"]
-        entries += [_spread(summarise(played["true_return"]))] if differs else []
+        entries = [f"{name} (reference)", "–", "–", _over_episodes(played["return"]), "–"]
+        entries += [_over_episodes(played["true_return"])] if differs else []
         lines.append(markdown_row(entries))
     if best.get("mean") is not None:
         name = "ceiling" if best["kind"] == "exact" else "ceiling (an upper bound)"
@@ -119,6 +121,30 @@ def _failure_lines(failures: Sequence[Mapping]) -> list[str]:
             f"{_cell_text(failure.get('reason', 'reason unknown'))}"
         )
     return sorted(lines)
+
+
+def _diverged_lines(episodes: pd.DataFrame) -> list[str]:
+    """One list item per trained lane with final episodes whose return is not a number."""
+    lines = []
+    for (env, disturbance, algorithm, length, seed), rows in episodes.groupby([*CELL, "seed"]):
+        if without := _without_number(rows["return"]):
+            lines.append(
+                f"- {_cell_text(env)}, {_cell_text(disturbance)}, {_cell_text(algorithm)}, "
+                f"l = {length}, seed {seed}: {without} of {len(rows)} final episodes have a return "
+                "that is not finite, so the lane is left out of the table"
+            )
+    return lines
+
+
+def _over_episodes(returns: pd.Series) -> str:
+    """The returns of a reference; a mean without its diverged episodes would be too high."""
+    if without := _without_number(returns):
+        return f"{without} of {len(returns)} episodes diverged"
+    return _spread(summarise(returns))
+
+
+def _without_number(returns: pd.Series) -> int:
+    return int((~np.isfinite(returns.astype(np.float64))).sum())
 
 
 def _select(table: pd.DataFrame, task: tuple[str, str]) -> pd.DataFrame:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rtd3jax.config import Config
+from rtd3jax.system.interrupts import patient
 from rtd3jax.system.jax_settings import jax_settings, with_settings
 from rtd3jax.training.executables import compiled
 from rtd3jax.training.lanes import Job, stacked, workers
@@ -89,8 +90,15 @@ def _on_all_workers(jobs: Sequence[Job]) -> list[tuple[float, float]]:
     ]
     for thread in threads:
         thread.start()
-    for thread in threads:
-        thread.join()
+    try:
+        for thread in threads:
+            thread.join()
+    finally:
+        # After an interrupt: a process that ends while its threads are inside XLA aborts.
+        with patient("the measurement ends after the program that is compiled now"):
+            together.abort()
+            for thread in threads:
+                thread.join()
     if errors:
         raise next(
             (e for e in errors if not isinstance(e, threading.BrokenBarrierError)), errors[0]
@@ -120,13 +128,15 @@ def _timed(
     seconds(start, start + block)
     together.wait()
     done, spent = 0, 0.0
-    while spent < _SECONDS:
+    while spent < _SECONDS and not together.broken:
         # Between two evaluations, which are timed separately.
         first = start + (-start) % config.eval_every
         length = min(block, max(together_at, config.eval_every - together_at))
         spent += seconds(first, first + length)
         done += length
         block *= 2
+    if together.broken:  # another worker failed, or the user interrupted
+        raise threading.BrokenBarrierError
     step = spent / done
     last = config.eval_every - together_at
     both = seconds(last, config.eval_every)

@@ -261,3 +261,14 @@ def test_ceilings_are_lines_where_they_are_known(tmp_path, drawn):
         assert not {"ceiling", "upper bound"} & {*found[2], *found[3]}
         words = [text.get_text() for text in figure.legends[0].get_texts()]
         assert words[-2:] == ["ceiling", "upper bound"]
+
+
+def test_a_reference_with_an_episode_without_a_number_has_no_line(drawn, tmp_path):
+    """The mean of its other episodes would be too high; an agent's mean is NaN then, too."""
+    good, bad = reference("random", -120.0), reference("controller", -110.0)
+    bad[1].append(bad[1][0] | {"episode": 1, "return": np.nan})
+    _, episodes = tables(cell(), good, bad)
+    figures.final_returns(episodes, tmp_path)
+    shown = {line.get_label() for axes in drawn[0].axes for line in axes.lines}
+    legend = {text.get_text() for text in drawn[0].legends[0].get_texts()}
+    assert "random policy" in legend and "controller policy" not in legend | shown

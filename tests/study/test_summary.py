@@ -181,3 +181,19 @@ def test_the_ceiling_is_the_last_row_where_it_is_known():
     of_truth = {**bound, "measure": "true_return"}
     assert last(of_truth) == ["ceiling (an upper bound)", "–", "–", "–", "–", "-0.5"]
     assert last(bound) == ["ceiling (an upper bound)", "–", "–", "-0.5", "–", "–"]
+
+
+def test_lanes_and_references_with_episodes_without_a_number_say_so():
+    """Their other episodes are no fair mean; the reference `random` has one episode per row."""
+    trained = rows("td3", 0, [-1.0, -2.0])
+    trained += [{**trained[1], "episode": 1, "return": math.inf}]
+    reference = [
+        {**row, "seed": -1, "episode": row["seed"]} for row in rows("random", 0, [-9.0, math.nan])
+    ]
+    text = render(trained + reference)
+    agent, other = table(text, "pendulum, none")
+    assert agent[2:4] == ["1 / 2", "-1"]
+    assert other[3] == "1 of 2 episodes diverged"
+    listed = text.split("## Lanes without a mean return\n\n")[1]
+    assert listed.startswith("- pendulum, none, td3, l = 0, seed 1: 1 of 2 final episodes")
+    assert "Lanes without a mean return" not in render(rows("td3", 0, [1.0]))

@@ -1,6 +1,9 @@
 """Tests the time estimate: some programs are measured, the others are interpolated."""
 
+import os
+import signal
 import threading
+import time
 from types import SimpleNamespace
 
 import jax
@@ -76,3 +79,26 @@ def test_what_fails_while_it_is_timed_is_raised(monkeypatch):
     monkeypatch.setattr(time_estimate, "_timed", fail)
     with pytest.raises(rtd.UserError, match="no such device"):
         time_estimate.group_seconds(_jobs("td3"))
+
+
+def test_no_measurement_outlives_an_interrupt(monkeypatch):
+    """A process that ends while a thread is inside XLA aborts."""
+    ended = []
+
+    def measure(jobs, device, together):
+        while not together.broken:
+            time.sleep(0.01)
+        ended.append(device)
+        raise threading.BrokenBarrierError
+
+    monkeypatch.setattr(time_estimate, "_timed", measure)
+    monkeypatch.setattr(time_estimate, "workers", lambda: ["first", "second"])
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        interrupt = threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT))
+        interrupt.start()
+        with pytest.raises(KeyboardInterrupt):
+            time_estimate.group_seconds(_jobs("td3"))
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert sorted(ended) == ["first", "second"]

@@ -22,7 +22,7 @@ from rtd3jax.study.log import LOG, lane_of, read_log, steps_reached
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.results import CELL, is_trained, reference_names, rounded_number
 from rtd3jax.study.rundir import RunDirectory
-from rtd3jax.study.statistics import Summary, iqm_bands, summarise
+from rtd3jax.study.statistics import Summary, iqm_bands, reference_mean, summarise
 from rtd3jax.study.status import ledger
 
 MOST_POINTS = 200
@@ -139,7 +139,8 @@ def _references(
     found = []
     for name in reference_names(here):
         of_policy = here[here["algorithm"] == name]
-        found.append({"name": name, **{m: rounded_number(of_policy[m].mean()) for m in measures}})
+        means = {m: rounded_number(reference_mean(of_policy[m])) for m in measures}
+        found.append({"name": name, **means})
     return found
 
 
