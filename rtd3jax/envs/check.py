@@ -119,7 +119,7 @@ def _findings(env: Any, params: Any, seed: int) -> list[Finding]:
     assert found.interface is not None
     fleet = fleet_of(env)
     with foreign_code(), contextlib.nullcontext() if fleet is None else fleet.for_a_while():
-        return list(_played(env, params, found.interface, seed))
+        return [*_whole_actions(env, params), *_played(env, params, found.interface, seed)]
 
 
 def _dtypes(found: Survey) -> Iterator[Finding]:
@@ -145,6 +145,19 @@ def _spaces(env: EnvironmentLike, params: object, found: Survey) -> Iterator[Fin
             "space",
             f"observation_space has shape {shape}, but the observation has {found.reset[0].shape}",
             "make observation_space(params) describe what reset and step return",
+        )
+
+
+def _whole_actions(env: EnvironmentLike, params: object) -> Iterator[Finding]:
+    """Advice for an environment whose actions are whole numbers."""
+    dtype = getattr(env.action_space(params), "dtype", None)
+    if dtype is not None and jnp.issubdtype(dtype, jnp.integer):
+        yield Finding(
+            "space",
+            f"action_space is a Box of {np.dtype(dtype)}, but agents choose real numbers between "
+            "its bounds, which step receives without rounding",
+            "round the action in step_env, or give the Box a float dtype",
+            advice=True,
         )
 
 

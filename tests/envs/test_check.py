@@ -377,3 +377,13 @@ def test_a_termination_of_its_own_is_not_a_time_limit():
 def test_no_environment_at_all():
     with pytest.raises(UserError, match="no method reset"):
         check_env(object())
+
+
+def test_actions_of_whole_numbers_are_a_warning(recwarn):
+    class Gears(Good):
+        def action_space(self, params):
+            return spaces.Box(-3, 3, (1,), jnp.int32)
+
+    check_env(Gears())
+    (warning,) = [str(w.message) for w in recwarn if w.category is UserWarning]
+    assert "action_space is a Box of int32" in warning and "round the action" in warning
