@@ -15,7 +15,6 @@ import numpy as np
 import pandas as pd
 
 import rtd3jax as rtd
-from rtd3jax.envs.registry import parse_disturbance
 from rtd3jax.evaluation.returns import both_returns
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
@@ -36,8 +35,7 @@ EPISODES, SEED = 1_000, 1
 
 def row(name: str, episodes: int, ceiling: float) -> dict[str, object]:
     """The returns of the filter under a disturbance."""
-    disturbance, parameters = parse_disturbance(name)
-    env = rtd.make("pendulum", disturbance, **parameters)
+    env = rtd.make("pendulum", name)
     policy = rtd.filter_policy(env)
     given, true = (np.asarray(r, np.float64) for r in both_returns(policy, env, episodes, SEED))
     floor = rtd.evaluate(rtd.random_policy(env), env, episodes, SEED, true_reward=True)

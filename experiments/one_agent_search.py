@@ -22,7 +22,6 @@ import numpy as np
 import pandas as pd
 
 import rtd3jax as rtd
-from rtd3jax.envs.registry import parse_disturbance
 from rtd3jax.study import presets
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
@@ -103,8 +102,7 @@ def results_of(policy: rtd.Policy, episodes: int) -> dict[str, float]:
     """Normalised return under each condition."""
     found = {}
     for condition in (*STRUCTURED, *NOISY):
-        name, parameters = parse_disturbance(condition)
-        env = rtd.make("pendulum", name, **parameters)
+        env = rtd.make("pendulum", condition)
         low, high = scale(condition)
         mean = float(np.mean(rtd.evaluate(policy, env, episodes, 9, true_reward=True)))
         found[condition] = (mean - low) / (high - low)
@@ -121,8 +119,7 @@ def search(setting: dict, episodes: int) -> dict:
     """Train the setting and test it; the results of a row."""
     began = time.process_time()
     fields = {name: value for name, value in setting.items() if name != "disturbance"}
-    name, parameters = parse_disturbance(setting["disturbance"])
-    env = rtd.make("pendulum", name, **parameters)
+    env = rtd.make("pendulum", setting["disturbance"])
     seeds = range(FIRST_SEED, FIRST_SEED + SEEDS)
     run = rtd.train(env, rtd.Config(**fields), seeds, progress=False)
     minutes = (time.process_time() - began) / 60 / SEEDS

@@ -27,7 +27,6 @@ import numpy as np
 import pandas as pd
 
 import rtd3jax as rtd
-from rtd3jax.envs.registry import parse_disturbance
 from rtd3jax.errors import UserError
 from rtd3jax.study import presets
 from rtd3jax.study.derive import derive
@@ -72,8 +71,7 @@ FAILED = -0.1
 @functools.cache
 def scale(name: str) -> tuple[float, float]:
     """Mean return of the uniform random policy under a disturbance, and the ceiling."""
-    disturbance, parameters = parse_disturbance(name)
-    env = rtd.make("pendulum", disturbance, **parameters)
+    env = rtd.make("pendulum", name)
     returns = rtd.evaluate(rtd.random_policy(env), env, REFERENCE_EPISODES, 0, true_reward=True)
     return float(np.mean(returns)), rtd.ceiling(rtd.make("pendulum")).mean
 

@@ -19,7 +19,6 @@ import time
 import numpy as np
 
 import rtd3jax as rtd
-from rtd3jax.envs.registry import parse_disturbance
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from pendulum import scale  # noqa: E402
@@ -94,8 +93,7 @@ def search(setting: dict, episodes: int) -> dict:
     others = ("actions", "disturbance", "seeds")
     config = rtd.Config(**{name: value for name, value in setting.items() if name not in others})
     disturbance = setting["disturbance"]
-    name, parameters = parse_disturbance(disturbance)
-    env = rtd.make("pendulum", name, **parameters)
+    env = rtd.make("pendulum", disturbance)
     seeds = range(FIRST_SEED, FIRST_SEED + setting["seeds"])
     run = rtd.train(env, config, seeds, progress=False)
     low, high = scale(disturbance)

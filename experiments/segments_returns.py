@@ -25,7 +25,6 @@ import numpy as np
 import pandas as pd
 
 import rtd3jax as rtd
-from rtd3jax.envs.registry import parse_disturbance
 from rtd3jax.study import presets
 
 HERE = pathlib.Path(__file__).parent
@@ -134,8 +133,7 @@ def returns(
 ) -> dict[str, list[float]]:
     """Normalised mean return of each seed's final policy, with both ways of acting."""
     env_id, disturbance, _ = TASKS[task]
-    name, parameters = parse_disturbance(disturbance)
-    env = rtd.make(env_id, name, **parameters)
+    env = rtd.make(env_id, disturbance)
     run = rtd.train(env, rtd.Config(**{**settings(task), **fields, **tiny}), seeds, progress=False)
     low, high = (0.0, PAPERS_BEST) if env_id == "rover" else scale(disturbance)
     found = {}

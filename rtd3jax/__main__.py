@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from rtd3jax.cli.common import replace_unprintable
 from rtd3jax.envs.builtin import LISTED
-from rtd3jax.envs.registry import FAULTS
+from rtd3jax.envs.registered import FAULTS
 from rtd3jax.registries import AGENTS, MEMORIES
 from rtd3jax.study.presets import PRESETS
 from rtd3jax.system.versions import versions_of

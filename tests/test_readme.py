@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from rtd3jax.envs import registry
+from rtd3jax.envs import registered, registry
 from rtd3jax.envs.builtin import LISTED
 
 ROOT = pathlib.Path(__file__).parent.parent
@@ -74,7 +74,7 @@ OTHERWISE = {
 def test_the_table_of_disturbances_has_every_name_and_default(env):
     text = (ROOT / "docs" / "run_a_study.md").read_text().split("## Disturbances\n")[1]
     table = [line for line in text.split("\n## ")[0].splitlines() if line.startswith("| `")]
-    named = {**registry._entries[env].disturbances, **registry._FAULTS}
+    named = {**registry._entries[env].disturbances, **registered.FAULT_PROCESSES}
     for name, (_, process) in named.items():
         (row,) = [line for line in table if f"`{name}`" in line.split("|")[1]]
         for field in dataclasses.fields(process):

@@ -45,6 +45,8 @@ def load_policy(
         "seed": seed,
     }
     given = {name: value for name, value in given.items() if value is not None}
+    if not isinstance(path, str | os.PathLike):
+        raise UserError(f"load_policy needs the path of a file or a run directory, not {path!r}")
     path = user_path(path)
     try:
         is_directory = path.is_dir()

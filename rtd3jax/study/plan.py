@@ -9,7 +9,7 @@ from typing import Any
 from rtd3jax.agents.agent import make_part
 from rtd3jax.agents.networks import Network
 from rtd3jax.config import Config
-from rtd3jax.envs.registry import make, parse_disturbance
+from rtd3jax.envs.registry import make
 from rtd3jax.errors import UserError
 from rtd3jax.registries import AGENTS
 from rtd3jax.study.memory_plan import job_bytes, lanes_at_once
@@ -52,8 +52,7 @@ class Cell:
 
     def make_env(self) -> Any:
         """The cell's environment."""
-        disturbance, parameters = parse_disturbance(self.disturbance)
-        return make(self.env, disturbance, **parameters)
+        return make(self.env, self.disturbance)
 
     def to_dict(self) -> dict[str, Any]:
         """The fields as in config.json."""

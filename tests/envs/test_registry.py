@@ -17,10 +17,11 @@ from rtd3jax.envs import registry
 from rtd3jax.envs.builtin import DISTURBANCES, ENVIRONMENTS
 from rtd3jax.envs.disturbed import Disturbed, disturb
 from rtd3jax.envs.entry import parameters_of
+from rtd3jax.envs.parameters import parse_disturbance
 from rtd3jax.envs.processes.disturbances import GaussianNoise, Hidden, Pulses, Sine
 from rtd3jax.envs.processes.faults import Delay, Dropout
 from rtd3jax.envs.processes.process import Chain
-from rtd3jax.envs.registry import make, parse_disturbance, register
+from rtd3jax.envs.registry import make, register
 from rtd3jax.errors import UserError, nearest
 
 ALL = [(env, disturbance) for env in ENVIRONMENTS for disturbance in DISTURBANCES[env]]
@@ -228,10 +229,19 @@ def test_disturbances_are_parsed(text, expected):
     assert parse_disturbance(text) == expected
 
 
-@pytest.mark.parametrize("text", ["", ":sigma=1", "noise:sigma", "noise:=1", "noise:a=1,a=2"])
+@pytest.mark.parametrize("text", ["", ":sigma=1", "noise:sigma", "noise:=1", "noise:a=1,a=2", None])
 def test_malformed_disturbances_are_refused(text):
     with pytest.raises(UserError):
         parse_disturbance(text)
+
+
+def test_the_name_of_a_disturbance_may_contain_its_parameters():
+    env = make("pendulum", "noise:sigma=1.0,reward_from=state", max_torque=1.5)
+    same = make("pendulum", "noise", sigma=1.0, reward_from="state", max_torque=1.5)
+    assert env == same and env.default_params == same.default_params
+    assert env.default_params.observation.sigma == 1.0 and env.reward_from == "state"
+    with pytest.raises(UserError, match="'sigma' is given twice"):
+        make("pendulum", "noise:sigma=1.0", sigma=2.0)
 
 
 def test_registered_environments_are_made(monkeypatch):
@@ -265,6 +275,11 @@ def test_a_registered_environment_gets_parameters_and_disturbances(monkeypatch):
     for name in ("dropout", "none", "a+b", "a:b", ""):
         with pytest.raises(UserError, match="cannot be called"):
             register("robot2", base, {name: Delay()})
+    for pair in (("action",), ("action", Delay(), 3)):
+        with pytest.raises(UserError, match="a process or a pair"):
+            register("robot2", base, {"lag": pair})
+    with pytest.raises(UserError, match="must be a dict"):
+        register("robot2", base, Delay())
     with pytest.raises(UserError, match="element 9"):
         register("robot2", base, {"blind": Hidden(element=9)})
 

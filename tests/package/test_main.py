@@ -7,7 +7,7 @@ import pytest
 
 import rtd3jax
 from rtd3jax.__main__ import commands, main
-from rtd3jax.envs.registry import FAULTS
+from rtd3jax.envs.registered import FAULTS
 from rtd3jax.registries import AGENTS, MEMORIES
 from rtd3jax.study.presets import PRESETS
 

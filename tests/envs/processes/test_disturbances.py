@@ -13,7 +13,8 @@ from rtd3jax.envs.disturbed import Disturbed, DisturbedParams
 from rtd3jax.envs.pendulum.environment import Pendulum
 from rtd3jax.envs.processes.disturbances import DampedSine, GaussianNoise, Hidden, Pulses, Sine
 from rtd3jax.envs.processes.process import Chain, Process
-from rtd3jax.envs.registry import FAULTS, make
+from rtd3jax.envs.registered import FAULTS
+from rtd3jax.envs.registry import make
 from rtd3jax.errors import UserError
 
 EPISODES, STEPS = 1000, 200

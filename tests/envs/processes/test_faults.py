@@ -12,7 +12,8 @@ from rtd3jax.envs.interface import describe
 from rtd3jax.envs.processes.disturbances import GaussianNoise, Hidden
 from rtd3jax.envs.processes.faults import Delay, Dropout, GainDrift, OrnsteinUhlenbeck, Quantisation
 from rtd3jax.envs.processes.process import Chain, Nothing, Process, Sum
-from rtd3jax.envs.registry import FAULTS, make
+from rtd3jax.envs.registered import FAULTS
+from rtd3jax.envs.registry import make
 from rtd3jax.errors import UserError
 
 STEPS = 300

@@ -7,7 +7,6 @@ import pytest
 
 import rtd3jax as rtd
 from rtd3jax.envs.disturbed import seen_elements
-from rtd3jax.envs.registry import parse_disturbance
 from rtd3jax.study.lane_files import cell_name
 
 STEPS = 30
@@ -69,8 +68,7 @@ def test_a_weight_of_zero_never_acts_and_members_draw_independently():
 )
 def test_the_pendulum_by_name(name, kinds):
     """Noise is never zero, a sine often is: the first observation tells an episode's kind."""
-    disturbance, parameters = parse_disturbance(name)
-    env = rtd.make("pendulum", disturbance, **parameters)
+    env = rtd.make("pendulum", name)
     played = rtd.rollout(rtd.constant_policy([0.0]), env, seed=0, episodes=24)
     kept = seen_elements(env, env.default_params, 3)
     assert kept == ([0, 1] if "hidden" in name else [0, 1, 2])

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from rtd3jax.envs.builtin import DISTURBANCES
-from rtd3jax.envs.registry import FAULTS, make
+from rtd3jax.envs.registered import FAULTS
+from rtd3jax.envs.registry import make
 
 STEPS = 200
 
