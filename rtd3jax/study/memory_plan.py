@@ -34,13 +34,18 @@ WORKER_BYTES = 700 * 2**20
 
 
 def state_bytes(job: Job) -> int:
-    """Exact bytes of a lane's state: parameters, optimisers, replay, carries, environment."""
+    """Bytes of a lane: its state and its environment's parameters, such as a recording.
+
+    The state has parameters, optimisers, replay, carries and the environment's state. Under
+    ``map``, lanes on one device share the environment's parameters, which this does not consider.
+    """
 
     def size(leaf: jax.Array | jax.ShapeDtypeStruct) -> int:
         key = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
         return leaf.size * (8 if key else leaf.dtype.itemsize)
 
-    return sum(map(size, jax.tree.leaves(jax.eval_shape(job.program.init, job.lane))))
+    state = jax.eval_shape(job.program.init, job.lane)
+    return sum(map(size, jax.tree.leaves((state, job.lane.env_params))))
 
 
 def working_bytes(config: Config, observation_size: int, action_size: int) -> int:

@@ -497,8 +497,12 @@ def make_lane(config: Config, seed: int, env_params: object) -> Lane:
     """A lane of the program of `make_program`; its leaves are concrete arrays."""
     numbers = {name: jnp.float32(getattr(config, name)) for name in traced_fields()}
     numbers["history_length"] = jnp.int32(config.window_tokens)
-    env_params = jax.tree.map(_array, env_params)
-    return Lane(jnp.uint32(seed), Hyperparameters(**numbers), env_params)
+    return Lane(jnp.uint32(seed), Hyperparameters(**numbers), as_arrays(env_params))
+
+
+def as_arrays(env_params: object) -> Any:
+    """The parameters of an environment as JAX arrays; JAX arrays are not copied."""
+    return jax.tree.map(_array, env_params)
 
 
 def _array(leaf: ArrayLike) -> jax.Array:

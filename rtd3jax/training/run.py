@@ -36,6 +36,7 @@ from rtd3jax.training.loop import (
     HEALTHY,
     LOSS_NOT_FINITE,
     LaneState,
+    as_arrays,
     make_lane,
     make_program,
 )
@@ -294,6 +295,7 @@ def make_jobs(
     )
     _ = program.agent  # raises UserError, before anything is compiled or written
     starts = starts or {}
+    params = as_arrays(params)  # once, so that all lanes share a recording
     return [
         Job(program, make_lane(config, seed, params), cell, seed, starts.get(seed))
         for seed in seeds

@@ -4,6 +4,7 @@ import time
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import rtd3jax as rtd
@@ -97,3 +98,14 @@ def test_chunks_give_the_same_results():
         for seed, curve in returns.items():
             exact = found[strategy, None][seed]
             assert jnp.allclose(curve, exact, rtol=0 if strategy == "map" else 1e-4)
+
+
+def test_the_plan_counts_a_recording_which_the_lanes_of_a_study_share():
+    log = np.zeros((250_000, 2), np.float32)
+    env = rtd.disturb(rtd.make("rover"), rtd.Recorded(log))
+    jobs = make_jobs(env, rtd.Config("td3", total_steps=2_000), [0, 1])
+    without, _ = memory_plan.job_bytes(_jobs())[_jobs()[0].program]
+    kept, _ = memory_plan.job_bytes(jobs)[jobs[0].program]
+    assert 0 <= kept - without - log.nbytes < 1_000
+    one, other = (jax.tree.leaves(job.lane.env_params) for job in jobs)
+    assert all(a is b for a, b in zip(one, other, strict=True))
