@@ -32,7 +32,7 @@ from rtd3jax.study.process_plan import Shares, shares_of
 from rtd3jax.study.processes import train_in_processes
 from rtd3jax.study.run import Trainer, run_study
 from rtd3jax.study.rundir import RunDirectory, holds_study
-from rtd3jax.study.starts import add_starts, check_starts_stay
+from rtd3jax.study.starts import check_starts_stay, planned_jobs
 from rtd3jax.study.status import ledger
 from rtd3jax.system.imports import import_modules
 from rtd3jax.training.lanes import Job, workers
@@ -136,12 +136,11 @@ def _plan(options: argparse.Namespace) -> _Plan:
     if options.fresh and holds_study(out):
         check_starts_stay(cells, out)
     additions = "" if options.fresh else directory.plan()
-    jobs = directory.jobs(strategy)
+    jobs = planned_jobs(directory, strategy, fresh=options.fresh)
     waiting = [job for job in jobs if options.fresh or not directory.lanes.is_done(*job.key)]
     shares = shares_of(processes, waiting, strategy)
     interval = sweep_options.parse_interval(options.checkpoint_every)
     shard = _shard(options)
-    add_starts(directory, jobs, write=False, fresh=options.fresh)
     return _Plan(directory, jobs, strategy, interval, shard, shares, additions)
 
 

@@ -12,21 +12,33 @@ from rtd3jax.training.lanes import Job
 from rtd3jax.training.start import Start, starts_of_path
 
 
+def planned_jobs(directory: RunDirectory, strategy: str, *, fresh: bool = False) -> list[Job]:
+    """A job with its start for each lane of the study; nothing is written.
+
+    Raises:
+        UserError: as `add_starts` does.
+    """
+    jobs = directory.jobs(strategy)
+    add_starts(directory, jobs, write=False, fresh=fresh)
+    return jobs
+
+
 def add_starts(
     directory: RunDirectory, jobs: Sequence[Job], *, write: bool, fresh: bool = False
 ) -> None:
-    """Give each job that is not done what it began from, and see that those can that are new.
+    """Give each unfinished job the networks from which its lane starts, and check them.
 
-    One that is under way has checkpoints, and may start over where they are of no use.
+    A lane that has checkpoints continues from them. It only needs its start if none of them can be
+    read, so a start that cannot be read is no error then.
 
     Args:
-        directory: of the study.
-        jobs: of its lanes.
-        write: whether to note what each begins from, beside its lane.
-        fresh: whether all are to begin, whatever is in the directory now.
+        directory: the run directory of the study.
+        jobs: the jobs of its lanes.
+        write: whether to write a file beside each lane that names its start.
+        fresh: whether all lanes start, whatever the directory holds now.
 
     Raises:
-        UserError: as `starts_of` does, or when it is of another agent or other sizes.
+        UserError: as `starts_of` does, or when a start is of another agent or has other sizes.
     """
     by_cell: dict[Cell, list[Job]] = {}
     for job in jobs:
@@ -55,28 +67,28 @@ def _start_or_why_not(cell: Cell, seed: int) -> Start:
 
 
 def check_starts_stay(cells: Iterable[Cell], out: Path) -> None:
-    """Raise UserError where a cell begins from what ``--fresh`` moves away with ``out``."""
+    """Raise UserError if a cell starts from a file in ``out``, which ``--fresh`` renames."""
     for start in dict.fromkeys(cell.config.start for cell in cells if cell.config.start):
         if _place(start)[0].resolve().is_relative_to(out.resolve()):
             raise UserError(
-                f"--start {start} lies in {out}, which --fresh moves away: give another --out, or "
-                "move that directory yourself and start from where it is then"
+                f"--start {start} lies in {out}, which --fresh renames: choose another --out, or "
+                "rename that directory yourself and name its new path in --start"
             )
 
 
 def _place(start: str) -> tuple[Path, str]:
-    """The path that ``start`` of a configuration names, and of which disturbance ("" for any)."""
+    """The path and the disturbance ("" for any) in the field ``start`` of a configuration."""
     path, _, disturbance = start.partition("@")
     directory = user_path(path)
     return (directory, disturbance) if directory.is_dir() else (user_path(start), "")
 
 
 def starts_of(cell: Cell, seeds: Sequence[int]) -> dict[int, Start]:
-    """The start of each seed; empty if the cell begins with new weights.
+    """The start of each seed; empty if the cell starts with new weights.
 
     Raises:
-        UserError: when ``start`` of the cell's configuration names nothing that can be read, or no
-            lane of the same agent and seed.
+        UserError: when the file or directory in the field ``start`` cannot be read, or has no lane
+            of the same agent and seed.
     """
     if not cell.config.start:
         return {}
@@ -103,7 +115,7 @@ def _start(directory: RunDirectory, cell: Cell, seed: int, disturbance: str) -> 
         there = dict.fromkeys(
             f"{c.config.algorithm} under {c.disturbance}" for c in directory.cells
         )
-        raise UserError(f"{path} has no {wanted} to begin from, only {', '.join(there)}")
+        raise UserError(f"{path} has no {wanted} to start from, only {', '.join(there)}")
     if len(fitting) > 1:
         names = dict.fromkeys(f"{path}@{other.disturbance}" for other in fitting)
         if len(names) == 1:
@@ -118,7 +130,7 @@ def _start(directory: RunDirectory, cell: Cell, seed: int, disturbance: str) -> 
         )
     (other,) = fitting
     if seed not in directory.seeds:
-        raise UserError(f"{path} has no seed {seed} to begin from; its seeds are {directory.seeds}")
+        raise UserError(f"{path} has no seed {seed} to start from; its seeds are {directory.seeds}")
     where = f"{path} {other.env} {other.disturbance}"
     place = directory.lanes.checkpoint_directory(other, seed)
     steps = checkpoint_steps(place)

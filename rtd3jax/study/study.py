@@ -27,7 +27,7 @@ from rtd3jax.study.plan import Cell
 from rtd3jax.study.report.page import write_page
 from rtd3jax.study.run import run_study
 from rtd3jax.study.rundir import RunDirectory, holds_study
-from rtd3jax.study.starts import add_starts
+from rtd3jax.study.starts import planned_jobs
 from rtd3jax.study.status import ledger
 from rtd3jax.study.tables import current_tables
 from rtd3jax.system.files import user_path
@@ -65,7 +65,7 @@ class Study:
         directory.plan()
         if not holds_study(directory.path):  # opening a study does not extend it
             # Raises UserError before any file is written.
-            add_starts(directory, directory.jobs(check_strategy(None)), write=False)
+            planned_jobs(directory, check_strategy(None))
             directory.prepare()
         self._directory = directory
 
@@ -102,8 +102,7 @@ class Study:
         directory, strategy = self._directory, check_strategy(strategy)
         check_loggers(log)
         directory.plan()
-        jobs = directory.jobs(strategy)
-        add_starts(directory, jobs, write=False)
+        jobs = planned_jobs(directory, strategy)
         at_once = lanes_at_once(jobs, strategy, len(workers()), usable_memory())
         interval = (checkpoint_seconds, None)
         work = Work(strategy, at_once, interval, quiet=quiet, page=page, keep=keep_checkpoints)

@@ -169,7 +169,7 @@ def starts_of_path(path: str | Path, seeds: tuple[int, ...]) -> dict[int, Start]
         files = checkpoint_files(path / f"seed-{seed}")
         if not files:
             raise UserError(
-                f"{path} is no saved policy, and has no checkpoint of seed {seed} to begin from"
+                f"{path} is no saved policy, and has no checkpoint of seed {seed} to start from"
             )
         found[seed] = Start(f"{path} seed {seed}", checkpoint=files[0])
     return found

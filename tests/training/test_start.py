@@ -271,8 +271,8 @@ def test_a_sweep_goes_on_from_another_and_says_so(tmp_path, monkeypatch, capsys)
     more = [*FLAGS, "--disturbances", "ar1-slip"]
     for start, seeds, message in (
         (first, 1, f"say which disturbance: {first}@ar1-slip-slow or {first}@ar1-slip-fast"),
-        (f"{first}@ar1-slip-slow", 2, "has no seed 1 to begin from"),
-        (f"{first}@ar1-slip", 1, "has no td3 under ar1-slip to begin from"),
+        (f"{first}@ar1-slip-slow", 2, "has no seed 1 to start from"),
+        (f"{first}@ar1-slip", 1, "has no td3 under ar1-slip to start from"),
     ):
         out = ["--out", second, "--start", start, "--seeds", str(seeds)]
         assert sweep.main([*more, *out]) == 2
@@ -312,7 +312,7 @@ def test_what_fresh_moves_away_is_no_start(tmp_path, capsys):
     for start in (own.path, f"{own.path}@ar1-slip", own.path / "policy", tmp_path / "link"):
         assert sweep.main(command("ar1-slip", "own", start)) == 2
         error = capsys.readouterr().err
-        assert f"--start {start} lies in {own.path}, which --fresh moves" in error
+        assert f"--start {start} lies in {own.path}, which --fresh renames" in error
         assert error.count("\n") == 1
     # What is done there now is to be trained again: its start is looked at before anything moves.
     (cell,) = own.cells
@@ -320,5 +320,5 @@ def test_what_fresh_moves_away_is_no_start(tmp_path, capsys):
     own.lanes.lane_path(cell, 0).touch()
     assert own.lanes.is_done(cell, 0)
     assert sweep.main(command("ar1-slip", "own", f"{other.path}@none")) == 2
-    assert "has no td3 under none to begin from" in capsys.readouterr().err
+    assert "has no td3 under none to start from" in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "other", "own"]
