@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import jaxlib
 
 from rtd3jax.envs.compat.simulated import is_simulated
 from rtd3jax.envs.interface import describe, foreign_code
@@ -101,7 +102,7 @@ def _code_of(env: EnvironmentLike, params: object) -> dict[str, str] | None:
 
     shape = env.action_space(params).shape
     # The text must not depend on the settings of the process, nor on its devices.
-    with with_settings(()), foreign_code():
+    with with_settings(()), foreign_code(), jax.disable_jit(False):
         key = random_key(0)
         state = jax.eval_shape(env.reset, key, params)[1]
         action = jax.ShapeDtypeStruct(shape, jnp.float32)
@@ -109,4 +110,5 @@ def _code_of(env: EnvironmentLike, params: object) -> dict[str, str] | None:
         text = traced.lower(lowering_platforms=("cpu",)).as_text()
     if "callback" in text:
         return None
-    return {"jax": jax.__version__, "sha256": hashlib.sha256(text.encode()).hexdigest()}
+    versions = f"{jax.__version__}, jaxlib {jaxlib.__version__}"
+    return {"jax": versions, "sha256": hashlib.sha256(text.encode()).hexdigest()}

@@ -121,6 +121,8 @@ def test_the_numbers_and_settings_of_a_process_are_not_code(tmp_path):
     study(tmp_path, 0.08)
     with jax.default_matmul_precision("float32"), jax.enable_x64(True):
         assert plan_now(tmp_path) == ""
+    with jax.disable_jit():
+        assert plan_now(tmp_path) == ""
 
 
 def test_other_bounds_of_actions_make_another_plant(tmp_path):
