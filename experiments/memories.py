@@ -80,6 +80,7 @@ def main(arguments: list[str] | None = None) -> int:
                 own = rows[(rows["memory"] == memory) & (rows["disturbance"] == disturbance)]
                 if len(own) >= options.seeds:
                     continue
+                rows = rows.drop(own.index)  # all seeds of the cell are trained again
             new = trained(memory, disturbance, options.seeds, episodes, tiny)
             print(new, flush=True)
             rows = pd.concat([rows, pd.DataFrame(new)], ignore_index=True)

@@ -26,7 +26,7 @@ class Member:
     Attributes:
         cores: the cores to which the process is pinned; empty where the system cannot pin.
         lanes: the lanes that it trains now, as groups of one lane.
-        program: the program that it trained last, which it has compiled.
+        executable: `Job.executable` of the lanes that it trained last, which it has compiled.
         ready: whether it has imported the package and opened the study.
     """
 
@@ -39,7 +39,7 @@ class Member:
     ) -> None:
         self.cores = cores
         self.lanes: list[Group] = []
-        self.program: object = None
+        self.executable: object = None
         self.ready = False
         self._messages = messages
         package = str(Path(__file__).parents[2])
@@ -63,14 +63,14 @@ class Member:
         return self._process.pid
 
     def order(self, lanes: Sequence[Group], names: Sequence[tuple[int, int]]) -> None:
-        """Let the process train ``lanes``, whose places among the cells and seeds are ``names``."""
-        self.lanes, self.program = list(lanes), lanes[0].jobs[0].program
+        """Let the process train ``lanes``; ``names`` are the cell's index and the seed of each."""
+        self.lanes, self.executable = list(lanes), lanes[0].jobs[0].executable
         self._send({"lanes": [list(name) for name in names]})
 
     def end(self) -> None:
         """Tell the process to write checkpoints and to end."""
         assert self._process.stdin is not None
-        with contextlib.suppress(OSError):  # it has ended already
+        with contextlib.suppress(OSError):  # the process has ended already
             self._process.stdin.close()
 
     def wait(self, seconds: float) -> int | None:
@@ -87,24 +87,24 @@ class Member:
 
     def _send(self, message: dict[str, Any]) -> None:
         assert self._process.stdin is not None
-        with contextlib.suppress(OSError):  # it has ended, as a message will say
+        with contextlib.suppress(OSError):  # the process has ended, and `messages` reports it
             self._process.stdin.write(json.dumps(message) + "\n")
             self._process.stdin.flush()
 
     def _read(self) -> None:
         assert self._process.stdout is not None
         for line in self._process.stdout:
-            if line.endswith("\n"):  # else it was killed while it wrote
+            if line.endswith("\n"):  # else the process was killed while it wrote the line
                 self._messages.put((self, json.loads(line)))
         self._messages.put((self, None))
 
 
 class Crew:
-    """A context with a process for each share of the cores; all have ended when it is left.
+    """A context with a process for each share of the cores; at its end, all processes have ended.
 
     Args:
         shares: the cores of each process.
-        settings: what `rtd3jax.study.worker` reads first, except the cores.
+        settings: the settings that `rtd3jax.study.worker` reads first, without the cores.
         handles: files that the processes inherit: the locks of the run directory.
     """
 
@@ -143,7 +143,10 @@ class Crew:
         self.members.append(member)
 
     def messages(self, seconds: float) -> Iterator[tuple[Member, dict[str, Any] | None]]:
-        """Messages of processes, after at most ``seconds``; None for a process that has ended."""
+        """Each process with its message; None is the message of a process that has ended.
+
+        The call waits at most ``seconds`` for the first message.
+        """
         with contextlib.suppress(queue.Empty):
             yield self._messages.get(timeout=seconds)
             while True:

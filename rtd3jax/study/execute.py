@@ -25,12 +25,14 @@ class Work:
 
     Attributes:
         strategy: ``map`` or ``vmap``; see `rtd3jax.training.lanes`.
-        at_once: number of lanes that fit in memory.
-        interval: between checkpoints, (seconds, steps): None for both chooses it from their cost.
+        at_once: number of lanes that fit in memory; under ``vmap``, in the memory of a device.
+        interval: (seconds, steps) between checkpoints of a lane; with (None, None), it is five
+            minutes, or longer if a checkpoint takes long.
         quiet: whether to omit the progress bar and remarks.
         page: whether to write the page of the run.
         workers: maximum number of workers; all workers by default.
-        keep: whether to keep the last checkpoint of a lane that has ended, for more steps later.
+        keep: whether to keep the last checkpoint of a lane that has ended, so that the lane can
+            continue to more steps later.
         began: the value of `time.perf_counter` from which the log counts seconds, which is the same
             clock in all processes of a machine; the start of the training by default.
     """
@@ -63,9 +65,11 @@ def train_here(
     add_starts(directory, waiting, write=True)
     for job in waiting:
         directory.lanes.error_path(*job.key).unlink(missing_ok=True)
-    if work.at_once < len(waiting) and not work.quiet:
-        print(f"the memory is enough for {work.at_once:,} lanes: the others wait")
     devices = workers()[: work.workers]
+    on_each = work.strategy == "vmap" and len(devices) > 1
+    fit, each = (len(devices), " of each device") if on_each else (1, "")
+    if fit * work.at_once < len(waiting) and not work.quiet:
+        print(f"the memory is enough for {work.at_once:,} lanes{each}: the others wait")
     checkpoints = checkpoints_of(directory, work.interval)
     groups = make_groups(waiting, work.strategy, len(devices), work.at_once, checkpoints)
     interim = None if references is None else InterimResults(directory, references, page=work.page)
@@ -83,7 +87,7 @@ def train_here(
 
 
 def waiting_jobs(directory: RunDirectory, jobs: Sequence[Job]) -> list[Job]:
-    """The lanes that have not ended; prints the number of those that have."""
+    """The jobs of lanes that have not ended; the number of ended lanes is printed."""
     waiting = [job for job in jobs if not directory.lanes.is_done(*job.key)]
     if len(waiting) < len(jobs):
         print(f"{len(jobs) - len(waiting)} of {len(jobs)} lanes have ended already")
@@ -100,7 +104,7 @@ def checkpoints_of(
         found = {**cell.to_dict(), "seed": seed, "window": job.program.window_tokens}
         # The name of a disturbance does not identify a recording: its file may have changed.
         large = [leaf for leaf in jax.tree.leaves(job.lane.env_params) if leaf.size > MOST_NUMBERS]
-        # First, so that an error message names it, even if there are other differences.
+        # The recording comes first, so that an error message names it before other differences.
         return {"recorded": [named_numbers(leaf) for leaf in large], **found} if large else found
 
     return Checkpoints(

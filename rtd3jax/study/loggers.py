@@ -40,7 +40,7 @@ class Logger(Protocol):
 
 
 Run = TypeVar("Run")
-"""The tracker's object or id of a lane."""
+"""The type of a tracker's run: an object or an id."""
 
 
 class PerLane(abc.ABC, Generic[Run]):
@@ -112,7 +112,7 @@ class TensorBoard(PerLane[EventWriter]):
 
     def _begin(self, cell: Cell, seed: int) -> EventWriter:
         path = self._path / "tensorboard" / cell_name(cell) / f"seed-{seed}"
-        # With a shorter queue, a dead writer thread would block this one; a row never fills this.
+        # If the writer thread has died, a full queue would block this thread. A row never fills it.
         return self._make(str(path), max_queue=1000)
 
     def _points(self, run: EventWriter, values: dict[str, float], step: int) -> None:
@@ -230,12 +230,16 @@ class _Several:
 
 
 def check_loggers(names: Sequence[str]) -> None:
-    """Check that the trackers are installed.
+    """Check that the trackers are known and installed.
 
     Raises:
-        UserError: naming the extra that installs a missing tracker.
+        UserError: naming the known trackers, or the extra that installs a missing one.
     """
+    if isinstance(names, str):
+        raise UserError(f"log must be a list of trackers, such as [{names!r}], not {names!r}")
     for name in names:
+        if name not in LOGGERS:
+            raise UserError(f"unknown tracker {name!r} (known: {', '.join(LOGGERS)})")
         package, _ = LOGGERS[name]
         if importlib.util.find_spec(package) is None:
             raise UserError(f"--log {name} needs {package}: pip install 'rtd3jax[{name}]'")

@@ -37,7 +37,7 @@ def state_bytes(job: Job) -> int:
     """Bytes of a lane: its state and its environment's parameters, such as a recording.
 
     The state has parameters, optimisers, replay, carries and the environment's state. Under
-    ``map``, lanes on one device share the environment's parameters, which this does not consider.
+    ``map``, lanes on one device share the environment's parameters, but each lane counts them here.
     """
 
     def size(leaf: jax.Array | jax.ShapeDtypeStruct) -> int:
@@ -68,9 +68,9 @@ def working_bytes(config: Config, observation_size: int, action_size: int) -> in
 
 
 def job_bytes(jobs: Sequence[Job]) -> dict[Any, tuple[int, int]]:
-    """State bytes and temporary bytes of a lane, by program."""
-    examples = {job.program: job for job in jobs}
-    return {program: _lane_bytes(job) for program, job in examples.items()}
+    """State bytes and temporary bytes of a lane, by `Job.executable`."""
+    examples = {job.executable: job for job in jobs}
+    return {executable: _lane_bytes(job) for executable, job in examples.items()}
 
 
 # Several parts of a plan ask for the same lanes; each lane is traced for it.

@@ -76,7 +76,11 @@ _OWN_FIELDS = ("env", "disturbance")
 
 
 def make_cells(grids: Iterable[Grid], overrides: dict[str, Any]) -> list[Cell]:
-    """The distinct cells of ``grids``, in order; ``overrides`` are fields of all configurations."""
+    """The distinct cells of ``grids``, in order; ``overrides`` are fields of all configurations.
+
+    Raises:
+        UserError: when there are no cells, or a configuration is impossible.
+    """
     cells: dict[Cell, None] = {}
     with warnings.catch_warnings():
         # Several lengths only apply to agents with windows; td3 occurs once.
@@ -233,7 +237,8 @@ def plan_text(
     count = len(workers())
     fit = lanes_at_once(jobs, strategy, count, memory)  # before a lane is allocated and timed
     cost = estimate(jobs, strategy, say)
-    waits = f"; the other {len(jobs) - fit:,} wait" if fit < len(jobs) else ""
+    in_total = fit * (count if strategy == "vmap" else 1)
+    waits = f"; the other {len(jobs) - in_total:,} wait" if in_total < len(jobs) else ""
     lines = [f"{len(cells)} cells × {len(seeds)} seeds = {len(jobs)} lanes"]
     for cell in cells:
         config = cell.config

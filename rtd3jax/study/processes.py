@@ -33,7 +33,8 @@ from rtd3jax.training.progress import Progress
 _POLL_SECONDS = 0.3
 _END_SECONDS = 10.0
 _ATTEMPTS = 3
-"""Number of processes that may be killed while they train a lane, or before they train any."""
+"""A lane fails when this number of processes ended while they trained it; the training fails when
+this number of processes ended at their start."""
 
 
 def train_in_processes(
@@ -92,7 +93,7 @@ def train_in_processes(
                     study.give()  # before the tables, which take seconds
                     interim.refresh()
     finally:
-        log.steps()  # rows from before an interrupt
+        log.steps()  # sends the trackers the rows from before an interrupt
 
 
 class _Study:
@@ -126,16 +127,19 @@ class _Study:
                 member.order(lanes, [self._names[id(lane)] for lane in lanes])
 
     def _choose(self, member: Member) -> list[Group]:
-        """The lanes for a process: of the program that it has compiled, or else of one that no
-        other process has, or else of the one that has the most lanes."""
+        """The lanes for a process.
+
+        Their program is the one that the process has compiled, if lanes of it wait; else one that
+        no other process trains now; else the one with the most waiting lanes.
+        """
         waiting: dict[Any, list[Group]] = {}
         for group in self._waiting:
-            waiting.setdefault(group.jobs[0].program, []).append(group)
-        taken = {other.program for other in self._crew.members if other.lanes}
-        if member.program in waiting:
-            lanes = waiting[member.program]
+            waiting.setdefault(group.jobs[0].executable, []).append(group)
+        taken = {other.executable for other in self._crew.members if other.lanes}
+        if member.executable in waiting:
+            lanes = waiting[member.executable]
         else:
-            new = [lanes for program, lanes in waiting.items() if program not in taken]
+            new = [lanes for executable, lanes in waiting.items() if executable not in taken]
             lanes = new[0] if new else max(waiting.values(), key=len)
         # A lane whose process was killed may be the cause: it is trained alone.
         alone = self._killed[id(lanes[0])] > 0
@@ -166,7 +170,7 @@ class _Study:
     def _replace(self, member: Member) -> None:
         """Let another process train the lanes of one that has ended before its time."""
         status = member.wait(_END_SECONDS)
-        member.kill()  # for the case that it has only closed its output
+        member.kill()  # it may only have closed its output
         how = f"signal {-status}" if status is not None and status < 0 else f"status {status}"
         self._crew.members.remove(member)
         if not member.ready:
@@ -178,7 +182,9 @@ class _Study:
                 )
         for group in member.lanes:
             self._killed[id(group)] += 1
-            if self._killed[id(group)] < _ATTEMPTS:
+            if self._directory.lanes.is_done(*group.jobs[0].key):
+                self.left -= 1  # it ended before the others that the process trained
+            elif self._killed[id(group)] < _ATTEMPTS:
                 self._waiting.insert(0, group)
             else:
                 self._fail(

@@ -32,7 +32,7 @@ from rtd3jax.study.status import ledger
 from rtd3jax.study.tables import current_tables
 from rtd3jax.system.files import user_path
 from rtd3jax.training.lanes import workers
-from rtd3jax.training.run import check_seeds, check_strategy
+from rtd3jax.training.run import check_checkpoints, check_seeds, check_strategy
 
 
 class Study:
@@ -92,15 +92,22 @@ class Study:
             log: names of trackers: ``tensorboard``, ``wandb``, ``mlflow``.
             strategy: ``map`` or ``vmap``; by default ``map`` on a CPU and ``vmap`` on an
                 accelerator.
-            checkpoint_seconds: time between checkpoints of a lane; by default as in the sweep.
+            checkpoint_seconds: time between checkpoints of a lane; by default five minutes, or
+                longer if checkpoints would take more than 2% of the time.
             keep_checkpoints: whether to keep the last checkpoint of a lane that has ended, so that
                 it can continue to more steps later.
 
         Returns:
             A line for each lane that was lost or failed.
+
+        Raises:
+            UserError: when a cell cannot be trained, a tracker cannot be opened, not even one lane
+                fits in memory, or another process writes to the directory.
+            KeyboardInterrupt: after an interrupt, when the results so far are written.
         """
         directory, strategy = self._directory, check_strategy(strategy)
         check_loggers(log)
+        check_checkpoints(None, checkpoint_seconds)
         directory.plan()
         jobs = planned_jobs(directory, strategy)
         at_once = lanes_at_once(jobs, strategy, len(workers()), usable_memory())
@@ -115,7 +122,7 @@ class Study:
         return complaints
 
     def status(self) -> pd.DataFrame:
-        """A row per lane: its cell, its seed, its state, and the reason if it was lost."""
+        """A row per lane: its cell, seed, state and step, and the reason if it was lost."""
         return pd.DataFrame(ledger(self._directory))
 
     def tables(self) -> dict[str, pd.DataFrame]:

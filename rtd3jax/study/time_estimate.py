@@ -8,6 +8,7 @@ by their operations.
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +24,9 @@ from rtd3jax.training.loop import Program
 MOST_PROGRAMS = 4
 """Maximum number of programs that are timed, because each must be compiled."""
 _SECONDS = 1.0
+
+Executable = tuple[Program, Any]
+"""`Job.executable`"""
 
 
 def study_seconds(
@@ -42,22 +46,22 @@ def study_seconds(
         say: receives a line before each measurement.
     """
     devices = len(workers())
-    lanes: dict[Program, list[Job]] = {}
+    lanes: dict[Executable, list[Job]] = {}
     for job in jobs:
-        lanes.setdefault(job.program, []).append(job)
-    programs = sorted(lanes, key=lambda program: operations(program.config))
-    count = min(MOST_PROGRAMS, len(programs))
-    places = sorted({round(k * (len(programs) - 1) / max(1, count - 1)) for k in range(count)})
-    timed: dict[Program, float] = {}
+        lanes.setdefault(job.executable, []).append(job)
+    executables = sorted(lanes, key=lambda executable: operations(executable[0].config))
+    count = min(MOST_PROGRAMS, len(executables))
+    places = sorted({round(k * (len(executables) - 1) / max(1, count - 1)) for k in range(count)})
+    timed: dict[Executable, float] = {}
     for number, place in enumerate(places, 1):
-        program = programs[place]
-        config = program.config
+        own = lanes[executables[place]]
+        config = own[0].program.config
         say(f"timing {number} of {len(places)}: {config.algorithm} l={config.window_tokens}")
-        width = 1 if strategy == "map" else -(-len(lanes[program]) // devices)
-        timed[program] = group_seconds(lanes[program][:width])
-    whole = _filled_in(programs, timed, operations)
+        width = 1 if strategy == "map" else -(-len(own) // devices)
+        timed[executables[place]] = group_seconds(own[:width])
+    whole = _filled_in(executables, timed, operations)
     if strategy == "map":
-        return sum(whole[job.program] for job in jobs) / devices
+        return sum(whole[job.executable] for job in jobs) / devices
     return sum(whole.values())
 
 
@@ -88,9 +92,9 @@ def _on_all_workers(jobs: Sequence[Job]) -> list[tuple[float, float]]:
         threading.Thread(target=work, args=(number, device), daemon=True)
         for number, device in enumerate(devices)
     ]
-    for thread in threads:
-        thread.start()
     try:
+        for thread in threads:
+            thread.start()
         for thread in threads:
             thread.join()
     finally:
@@ -98,7 +102,8 @@ def _on_all_workers(jobs: Sequence[Job]) -> list[tuple[float, float]]:
         with patient("the measurement ends after the program that is compiled now"):
             together.abort()
             for thread in threads:
-                thread.join()
+                if thread.ident is not None:  # it was started
+                    thread.join()
     if errors:
         raise next(
             (e for e in errors if not isinstance(e, threading.BrokenBarrierError)), errors[0]
@@ -121,7 +126,8 @@ def _timed(
         jax.block_until_ready(state)
         return time.perf_counter() - began
 
-    # Transitions of zeros take as long as others. The number of steps is a multiple of updates.
+    # The replay only holds zeros, which take as long as other transitions. A block has at least the
+    # steps of one actor update.
     together_at = config.environments  # steps are counted over all environments
     start = config.first_learning_step * together_at
     block = max(config.update_every, together_at) * config.policy_delay
@@ -129,7 +135,7 @@ def _timed(
     together.wait()
     done, spent = 0, 0.0
     while spent < _SECONDS and not together.broken:
-        # Between two evaluations, which are timed separately.
+        # These steps lie between two evaluations, which are timed separately.
         first = start + (-start) % config.eval_every
         length = min(block, max(together_at, config.eval_every - together_at))
         spent += seconds(first, first + length)
@@ -144,19 +150,22 @@ def _timed(
 
 
 def _filled_in(
-    programs: Sequence[Program],
-    timed: Mapping[Program, float],
+    executables: Sequence[Executable],
+    timed: Mapping[Executable, float],
     operations: Callable[[Config], float],
-) -> dict[Program, float]:
+) -> dict[Executable, float]:
     """The seconds of a lane of every program, interpolated between the timed programs."""
 
-    def work(program: Program) -> float:
-        return operations(program.config)
+    def work(executable: Executable) -> float:
+        return operations(executable[0].config)
+
+    def total_steps(executable: Executable) -> int:
+        return executable[0].config.total_steps
 
     known = sorted(timed, key=work)
-    a_step = [timed[program] / program.config.total_steps for program in known]
-    steps = np.interp([work(p) for p in programs], [work(p) for p in known], a_step)
+    a_step = [timed[one] / total_steps(one) for one in known]
+    steps = np.interp(list(map(work, executables)), list(map(work, known)), a_step)
     return {
-        program: timed.get(program, float(step) * program.config.total_steps)
-        for program, step in zip(programs, steps, strict=True)
+        one: timed.get(one, float(step) * total_steps(one))
+        for one, step in zip(executables, steps, strict=True)
     }

@@ -9,6 +9,7 @@ keep two cores equally busy.
 
 import contextlib
 import dataclasses
+import functools
 import threading
 import time
 import warnings
@@ -62,6 +63,14 @@ class Job:
     def key(self) -> tuple[Any, int]:
         """The unique key of the job."""
         return self.cell, self.seed
+
+    @functools.cached_property
+    def executable(self) -> tuple[Program, Any]:
+        """Equal for jobs that share executables, and so can advance together.
+
+        Equal environments can have parameters of different structure, such as other disturbances.
+        """
+        return self.program, structure_of(self.lane)
 
 
 @dataclasses.dataclass(eq=False)
@@ -164,7 +173,7 @@ def make_groups(
         return [Group([job], wave=index // most) for index, job in enumerate(jobs)]
     by_program: dict[Any, list[Job]] = {}
     for job in jobs:
-        by_program.setdefault((job.program, structure_of(job.lane)), []).append(job)
+        by_program.setdefault(job.executable, []).append(job)
     steps_of = checkpoints.steps if checkpoints is not None else lambda job: set()
     shares = []
     for members in by_program.values():
@@ -358,9 +367,9 @@ def _save(group: Group, checkpoints: Checkpoints) -> None:
 
 
 def _host(device: jax.Device) -> jax.Device:
-    """The device on which states are put together.
+    """The device on which the states of lanes are combined.
 
-    An accelerator has memory for one state of a group, but not for its parts besides.
+    An accelerator has memory for the state of a group, but not also for its parts.
     """
     try:
         return jax.local_devices(backend="cpu")[0]
@@ -385,7 +394,7 @@ def _restore(group: Group, checkpoints: Checkpoints, device: jax.Device) -> None
 
 
 def _together(trees: Sequence[Any]) -> Any:
-    """The tree of a group, from those of its lanes; several lanes get a leading axis."""
+    """The tree of a group, from the trees of its lanes; several lanes get a leading axis."""
     if len(trees) == 1:
         return trees[0]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)

@@ -4,6 +4,7 @@ import struct
 
 import pytest
 
+import rtd3jax as rtd
 from rtd3jax.cli import sweep
 from rtd3jax.errors import UserError
 from rtd3jax.study import loggers, run
@@ -106,6 +107,13 @@ def test_what_is_not_installed_is_named(monkeypatch):
     monkeypatch.setitem(loggers.LOGGERS, "wandb", ("no_such_package", None))
     with pytest.raises(UserError, match=r"pip install 'rtd3jax\[wandb\]'"):
         check_loggers(["wandb"])
+
+
+@pytest.mark.parametrize("names", (["csv"], "tensorboard"))
+def test_a_study_refuses_an_unknown_tracker_and_a_name_that_is_no_list(tmp_path, names):
+    cell = rtd.Cell("rover", "none", rtd.Config("td3"))
+    with pytest.raises(UserError, match="unknown tracker 'csv'|must be a list of trackers"):
+        rtd.Study([cell], seeds=[0], out=tmp_path / "run").run(log=names)
 
 
 class Failing:

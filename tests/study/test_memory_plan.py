@@ -35,14 +35,14 @@ def test_the_plan_is_within_15_percent_of_what_xla_reserves(algorithm, length, r
     advance = jax.jit(job.program.advance, donate_argnums=1)
     options = {"xla_cpu_multi_thread_eigen": False}
     used = advance.lower(job.lane, state, step, step).compile(options).memory_analysis()
-    kept, work = memory_plan.job_bytes([job])[job.program]
+    kept, work = memory_plan.job_bytes([job])[job.executable]
     assert abs(kept / used.output_size_in_bytes - 1) < 0.01
     assert abs((kept + work) / (used.output_size_in_bytes + used.temp_size_in_bytes) - 1) < 0.15
 
 
 def test_lanes_that_do_not_fit_wait_for_their_turn():
     jobs = _jobs(seeds=10)
-    kept, work = memory_plan.job_bytes(jobs)[jobs[0].program]
+    kept, work = memory_plan.job_bytes(jobs)[jobs[0].executable]
     need = (5 * kept + 2 * work) / 0.8
     assert memory_plan.lanes_at_once(jobs, "map", 2, int(need) + 1) == 4
     assert memory_plan.lanes_at_once(jobs, "vmap", 2, int(3.5 * (kept + work) / 0.8)) == 3
@@ -104,8 +104,19 @@ def test_the_plan_counts_a_recording_which_the_lanes_of_a_study_share():
     log = np.zeros((250_000, 2), np.float32)
     env = rtd.disturb(rtd.make("rover"), rtd.Recorded(log))
     jobs = make_jobs(env, rtd.Config("td3", total_steps=2_000), [0, 1])
-    without, _ = memory_plan.job_bytes(_jobs())[_jobs()[0].program]
-    kept, _ = memory_plan.job_bytes(jobs)[jobs[0].program]
+    without, _ = memory_plan.job_bytes(_jobs())[_jobs()[0].executable]
+    kept, _ = memory_plan.job_bytes(jobs)[jobs[0].executable]
     assert 0 <= kept - without - log.nbytes < 1_000
     one, other = (jax.tree.leaves(job.lane.env_params) for job in jobs)
     assert all(a is b for a, b in zip(one, other, strict=True))
+
+
+def test_the_plan_looks_at_every_disturbance_of_an_environment():
+    """The program of two recordings is the same, so the later one does not hide the earlier one."""
+    envs = [
+        rtd.disturb(rtd.make("rover"), rtd.Recorded(np.zeros((rows, 2), np.float32)))
+        for rows in (250_000, 300)
+    ]
+    jobs = [job for env in envs for job in make_jobs(env, rtd.Config("td3"), [0])]
+    sizes = [kept for kept, _ in memory_plan.job_bytes(jobs).values()]
+    assert len(sizes) == 2 and max(sizes) - min(sizes) > 1_900_000

@@ -83,9 +83,12 @@ def test_what_fails_while_it_is_timed_is_raised(monkeypatch):
 
 def test_no_measurement_outlives_an_interrupt(monkeypatch):
     """A process that ends while a thread is inside XLA aborts."""
-    ended = []
+    begun, ended, jobs = [], [], _jobs("td3")
 
     def measure(jobs, device, together):
+        begun.append(device)
+        if len(begun) == 2:
+            os.kill(os.getpid(), signal.SIGINT)  # the main thread handles it
         while not together.broken:
             time.sleep(0.01)
         ended.append(device)
@@ -95,10 +98,21 @@ def test_no_measurement_outlives_an_interrupt(monkeypatch):
     monkeypatch.setattr(time_estimate, "workers", lambda: ["first", "second"])
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        interrupt = threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT))
-        interrupt.start()
         with pytest.raises(KeyboardInterrupt):
-            time_estimate.group_seconds(_jobs("td3"))
+            time_estimate.group_seconds(jobs)
     finally:
         signal.signal(signal.SIGINT, before)
     assert sorted(ended) == ["first", "second"]
+
+
+def test_lanes_of_one_program_and_other_disturbances_are_timed_apart(monkeypatch):
+    """Equal environments can have parameters of another structure, which cannot be stacked."""
+    monkeypatch.setattr(time_estimate, "_SECONDS", 0.05)
+    fields = dict(total_steps=1_000, hidden_size=4, batch_size=4, learning_starts=200)
+    config = rtd.Config("td3", **fields, eval_every=500, eval_episodes=1)
+    slips = [rtd.make("rover", name) for name in ("ar1-slip", "sine-slip")]
+    jobs = [job for env in slips for job in make_jobs(env, config, [0])]
+    assert jobs[0].program == jobs[1].program and jobs[0].executable != jobs[1].executable
+    told = []
+    assert time_estimate.study_seconds(jobs, "vmap", lambda config: 1.0, told.append) > 0.0
+    assert len(told) == 2

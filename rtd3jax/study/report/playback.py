@@ -21,6 +21,7 @@ from rtd3jax.envs.registry import description_of
 from rtd3jax.errors import UserError, short_reason
 from rtd3jax.evaluation.rollout import element_names, play_episodes
 from rtd3jax.protocols import EnvironmentLike, PolicyLike
+from rtd3jax.study.lane_files import cell_name
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.report.data import rows_of
 from rtd3jax.study.results import rounded_number
@@ -62,7 +63,7 @@ def recordings(
             try:
                 kept = {**stamp, **_recorded(directory, cell, seed, longest, count)}
             except UserError as error:
-                problems.setdefault(str(error), []).append(path.stem)
+                problems.setdefault(str(error), []).append(f"{cell_name(cell)} {path.stem}")
                 continue
             write_bytes_atomically(path, json.dumps(kept).encode())
         if kept is not None:
