@@ -16,7 +16,7 @@ CELL = ["algorithm", "disturbance", "history_length"]
 
 
 Cells = dict[int, np.ndarray]
-"""The values of an agent under a disturbance: an array of seeds for each window length. An agent
+"""The values of an agent under a disturbance, by window length: an array [seeds] each. An agent
 without a window has length 0."""
 
 
@@ -31,9 +31,9 @@ def compare(
     """The effect between means of cells, with the same window lengths on both sides.
 
     While the trainings are incomplete, some cells may have window lengths that others lack. Only
-    the lengths of all count (of ``lengths``, if they are given); an agent without a window counts
-    with each. The parts of the effect are those at each length. ``fields`` are other fields of the
-    effect.
+    lengths that all cells have count (and of these only ``lengths``, if they are given). An agent
+    without a window counts with every length. The parts of the effect are the effects at each
+    length. ``fields`` are other fields of the effect.
     """
     windows = [set(cells) for cells in (*better, *worse) if set(cells) != {0}]
     shared = set.intersection(*windows) if windows else set()
@@ -98,7 +98,7 @@ class Results:
     curves: pd.DataFrame
     """Learning curves on the pendulum."""
     carried: Trainings
-    """Returns of agents of `random-sine` under other disturbances."""
+    """Returns, under other disturbances, of agents that were trained under `random-sine`."""
     bench: pd.DataFrame
 
     @classmethod
@@ -115,7 +115,7 @@ class Results:
         return cls(rover, Trainings(pendulum), curves, Trainings(carried), rates)
 
     def on_rover(self, algorithm: str, trained: str, tested: str = "ar1-slip") -> np.ndarray:
-        """Mean return of each seed."""
+        """Mean return of each seed: float [seeds]; empty without results."""
         key = {"algorithm": algorithm, "trained_on": trained, "tested_on": tested}
         if self.rover.empty:
             return np.empty(0)

@@ -18,9 +18,9 @@ pendulum, as means over the window lengths that all sides of a comparison have. 
 comparison count as independent; each window length has a variance of its own, since the seeds of
 short windows differ most. Trainings with the same seed are a little alike, at other lengths and of
 other agents: claims.json has both correlations. The first makes a mean less certain than its
-interval says, the second makes a difference more certain. For iteration times, rounds of the
+interval says; the second makes a difference more certain. For iteration times, rounds of the
 benchmark replace seeds. Some cells got more seeds after an undecided test; the intervals are wider
-for each further look at a comparison (Bonferroni). What is not corrected is that the grid is tested
+for each further test of a comparison (Bonferroni). There is no correction for the tests of the grid
 while it grows.
 
 An agent learns faster than another if it has the higher mean over all evaluations of its first
@@ -55,18 +55,18 @@ BEST = "lstm-td3-1ha1hc"
 WHOLE, MIDDLE, LATE = (0.0, 1.0), (0.4, 0.6), (0.8, 1.0)
 """Parts of the training, for the clauses on its course."""
 ALIKE = 0.05
-"""Final returns so near to each other do not hide which agent learns faster."""
+"""Largest difference of final returns at which the mean during the training compares the speed."""
 
 
 def history_is_nothing(disturbance: str) -> Callable[[Results], list[Effect]]:
-    """Claims 1 and 2."""
+    """The comparison of claims 1 and 2: past actions make no difference."""
     return lambda results: history_helps(results.pendulum, disturbance, Equal)
 
 
 def history_helps(
     trainings: Trainings, disturbance: str, kind: type[Effect] = Effect
 ) -> list[Effect]:
-    """Action history helps."""
+    """The comparison of agents with and without past actions."""
     with_actions, without = (trainings.of(agent, disturbance) for agent in HISTORIES)
     name = " over ".join(HISTORIES)
     return [compare(name, [with_actions], [without], kind)]
@@ -75,7 +75,7 @@ def history_helps(
 def length_helps(
     trainings: Trainings, disturbance: str, kind: type[Effect] = Effect
 ) -> list[Effect]:
-    """The longest window over the shortest, with and without action history."""
+    """The comparison of the longest window with the shortest, with and without past actions."""
     found = []
     for agent in HISTORIES:
         cells = trainings.of(agent, disturbance)
@@ -88,13 +88,13 @@ def length_helps(
 
 
 def temporal_sine(results: Results) -> list[Effect]:
-    """Claim 3."""
+    """The comparisons of claim 3."""
     trainings = results.pendulum
     return history_helps(trainings, "temporal-sine") + length_helps(trainings, "temporal-sine")
 
 
 def noise(results: Results) -> list[Effect]:
-    """Claim 5."""
+    """The comparisons of claim 5."""
     found = history_helps(results.pendulum, "noise") + length_helps(results.pendulum, "noise")
     small, large = (results.pendulum.of("lstm-td3", name) for name in ("noise", HARD_NOISE))
     found.append(compare("lstm-td3, sigma 0.5 over 1.0", [small], [large]))
@@ -106,14 +106,14 @@ def noise(results: Results) -> list[Effect]:
 
 
 def hidden(results: Results) -> list[Effect]:
-    """Claim 6."""
+    """The comparisons of claim 6."""
     trainings = results.pendulum
     final = history_helps(trainings, "hidden", Equal) + length_helps(trainings, "hidden", Equal)
     return [*final, learns_faster(results, "hidden", *HISTORIES)]
 
 
 def learns_faster(results: Results, disturbance: str, faster: str, slower: str) -> Effect:
-    """Mean returns during the training, at the window lengths with which both end alike."""
+    """The comparison of mean returns during the training, at lengths with which both end alike."""
     ends = [results.pendulum.of(agent, disturbance) for agent in (faster, slower)]
     alike = [
         length
@@ -126,7 +126,7 @@ def learns_faster(results: Results, disturbance: str, faster: str, slower: str) 
 
 
 def memory_helps(results: Results) -> list[Effect]:
-    """Claim 7: each agent over `td3`; and their difference is larger where the claim says so."""
+    """Claim 7: each agent beats `td3`, and by more under `noise` and `hidden` than under sines."""
     trainings = results.pendulum
     td3 = {name: trainings.of("td3", name) for name in PARTIAL}
     found = [
@@ -167,7 +167,7 @@ def stored_carries(results: Results) -> list[Effect]:
 
 
 def iteration_time(results: Results) -> list[Effect]:
-    """Claim 10: the rate at every length, and the share of the rate at the longest window."""
+    """Claim 10: the rate at every length, and the share of it that the longest window keeps."""
     found, lengths = [], (1, 3, 6, 10, 20)
     for agent in LSTM_AGENTS:
         found += [
@@ -190,10 +190,10 @@ def iteration_time(results: Results) -> list[Effect]:
 
 
 def carries_over(results: Results) -> list[Effect]:
-    """Claim 11: policies of `random-sine` under each of three conditions over the same under noise.
+    """Claim 11: policies trained under `random-sine` carry over to three conditions, not to noise.
 
-    Noise is also more difficult than the others. So agents that were trained under it are compared
-    with those of `random-sine`, both under noise.
+    Noise is also more difficult than the other conditions. So agents that were trained under noise
+    are compared with the agents of `random-sine`, both under noise.
     """
     found = []
     for agent in RECURRENT:
@@ -215,13 +215,13 @@ def on_the_rover(name: str, better: np.ndarray, worse: np.ndarray) -> Effect:
 
 
 def agents_beat_td3(results: Results) -> list[Effect]:
-    """Claim 12."""
+    """The comparisons of claim 12."""
     td3 = results.on_rover("td3", "ar1-slip")
     return [on_the_rover(f"{a} over td3", results.on_rover(a, "ar1-slip"), td3) for a in RECURRENT]
 
 
 def sine_over_none(results: Results) -> list[Effect]:
-    """Claim 13."""
+    """The comparisons of claim 13."""
     return [
         on_the_rover(
             f"{a}, sine over none", results.on_rover(a, "sine-slip"), results.on_rover(a, "none")
@@ -231,7 +231,7 @@ def sine_over_none(results: Results) -> list[Effect]:
 
 
 def best_transfer(results: Results) -> list[Effect]:
-    """Claim 14."""
+    """The comparisons of claim 14."""
     best = results.on_rover(BEST, "sine-slip")
     others = [a for a in rtd.ALGORITHMS if a != BEST]
     return [

@@ -33,7 +33,7 @@ def train_missing(
     run: pathlib.Path,
     quick: bool,
 ) -> list[str]:
-    """`train` those of ``cells`` that are ``missing`` in ``table``, whose name it says."""
+    """`train` the ``missing`` cells, and print how many of ``cells`` the ``table`` has already."""
     print(f"{table} has {len(cells) - len(missing)} of {len(cells)} cells", flush=True)
     return train(missing, seeds, run, quick) if missing else []
 
@@ -48,7 +48,7 @@ def not_in(
 def untested_policies(
     run: pathlib.Path, cells: list[rtd.Cell], rows: pd.DataFrame, seeds: Sequence[int], has: Has
 ) -> tuple[list[tuple[rtd.Cell, int, rtd.Policy]], list[str]]:
-    """The trained policies in ``run`` that ``rows`` does not have, and a line for each not trained.
+    """The trained policies in ``run`` that ``rows`` does not have, and a line for each missing one.
 
     A policy comes with its cell and seed.
     """

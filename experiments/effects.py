@@ -10,21 +10,22 @@ FEWEST_SEEDS = 3
 MARGIN = 0.02
 """Margin of equivalence of normalised returns; it was fixed before the runs."""
 ROVER_MARGIN = MARGIN * 1.36
-"""The same of the rover's returns: 2% of the paper's best."""
+"""Margin of equivalence of the rover's returns: 2% of the paper's best return."""
 CONFIDENCE, EQUIVALENCE = 0.95, 0.90
 """Confidence of intervals, and of those that must lie within the margin. Two one-sided tests at 5%
 each reject a difference beyond the margin exactly if the 90% interval lies within it (Schuirmann,
 1987)."""
 SEEDS_OF_LOOKS = (5, 15)
-"""Seeds of a cell at the first look and at the second; a comparison was looked at once more when it
-got more of them."""
+"""The most seeds of a cell at the first test of a comparison, and at the second test. A cell with
+more seeds shows that the comparison was tested once more."""
 SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "undecided"
 NO_EFFECT = "no effect"
 
 
 Values = np.ndarray | Sequence["Values"]
-"""The values of seeds; or such an array for each cell of a grid, of which each has the same weight,
-and so on. The cells may have different numbers of seeds."""
+"""The values of seeds, [seeds]; or a sequence of such values, one for each cell of a grid. All
+entries of a sequence have the same weight; they may be sequences, and have different numbers of
+seeds."""
 
 
 def cells_of(values: Values, weight: float = 1.0) -> list[tuple[float, np.ndarray]]:
@@ -35,10 +36,10 @@ def cells_of(values: Values, weight: float = 1.0) -> list[tuple[float, np.ndarra
 
 
 def mean_interval(values: np.ndarray, confidence: float = CONFIDENCE) -> tuple[float, float, float]:
-    """The mean of values and its t interval, which a single value does not have (NaN).
+    """The mean of values and the bounds of its t interval; the bounds are NaN for a single value.
 
-    A percentile bootstrap of five values covers the mean less often than it says: in 87% of cases
-    instead of 95%, for normal values.
+    The interval is not a percentile bootstrap: for five normal values, a bootstrap interval of 95%
+    only contains the mean in 87% of cases.
     """
     if len(values) < 2:
         return float(values.mean()), np.nan, np.nan
@@ -69,7 +70,7 @@ class Effect:
     parts: tuple["Effect", ...] = ()
 
     def looks(self) -> int:
-        """How often the comparison was tested, by the most seeds of a cell."""
+        """How often the comparison was tested; this follows from the most seeds of a cell."""
         sides = (self.better, self.worse)
         most = max(len(cell) for side in sides for _, cell in cells_of(side))
         return 1 + sum(most > seeds for seeds in SEEDS_OF_LOOKS)
@@ -83,10 +84,10 @@ class Effect:
     def interval(self, confidence: float = CONFIDENCE) -> tuple[float, float, float]:
         """The difference of means and its interval, Welch's (1947) unless the sides are paired.
 
-        The mean of a side is that of the means of its cells. Each cell of either side has its own
-        variance, and their sum has the degrees of freedom of Welch and Satterthwaite; with one cell
-        a side, this is Welch's interval. Of paired sides, the differences within pairs count. The
-        error, which is the rest of ``confidence``, is divided by `looks`.
+        The mean of a side is the mean of its cells' means. Each cell of either side has its own
+        variance, and the sum has the degrees of freedom of Welch and Satterthwaite; with one cell
+        on each side, this is Welch's interval. If the sides are paired, the differences within
+        pairs count. The error, which is one minus ``confidence``, is divided by `looks`.
         """
         confidence = 1.0 - (1.0 - confidence) / self.looks()
         better = cells_of(self.better, self.factor)
@@ -145,7 +146,10 @@ class Equal(Effect):
     """A difference that should be zero by a claim: within the margin."""
 
     def verdict(self) -> str:
-        """Supported if the tests find no difference beyond the margin, contradicted if it is."""
+        """Supported if the tests find no difference beyond the margin.
+
+        Contradicted if the interval lies beyond the margin; otherwise undecided.
+        """
         if min(self.seeds()) < FEWEST_SEEDS:
             return UNDECIDED
         if self.bound() <= self.margin:

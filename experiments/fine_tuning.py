@@ -7,7 +7,7 @@ the checkpoints. Training then continues under AR(1) slip, from the actor alone,
 with critics and optimisers. For comparison, there are agents without further training, and agents
 with new weights for the same number of steps. There are five seeds, and 1,000 episodes for each
 test. The script writes fine_tuning.md, .parquet and .json. If you repeat the command, it only
-trains what is missing.
+trains what is missing; the trainings from the actor alone are always repeated.
 """
 
 import argparse

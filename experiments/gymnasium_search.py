@@ -8,7 +8,7 @@ tested on 100 episodes (of at most 1,000 steps, with a reward of 1 for each). Th
 experiments/results/gymnasium_search.csv: a row per setting, losers included. A setting that has a
 row is not trained again. No setting has balanced the pole with all of four seeds yet.
 
-`worst` is the lowest mean return of a seed, `action_value` the critic's mean value at the end,
+`worst` is the lowest mean return of a seed. `action_value` is the critic's mean value at the end,
 divided by that of an endless episode.
 """
 
@@ -50,7 +50,7 @@ BASE = {
     "normalise_observations": True,
 }
 FASTER = {"gamma": 0.98, "tau": 0.02}
-"""The critics' values come to their level within thousands of updates: 1 / ((1 - gamma) tau)."""
+"""The critics' values reach their level in about 1 / ((1 - gamma) tau) updates, here 2,500."""
 SHORT = {"gamma": 0.95, "tau": 0.02}
 WINDOWS = {
     **SHORT,
@@ -73,7 +73,7 @@ CHANGES: tuple[dict, ...] = (
 
 
 def search(setting: dict, episodes: int) -> dict:
-    """Train the setting and test it; the results of a row."""
+    """Train the setting and test it; return the results of its row."""
     began = time.process_time()
     seeds = range(setting["first_seed"], setting["first_seed"] + setting["seeds"])
     fields = {name: value for name, value in setting.items() if name not in ("first_seed", "seeds")}

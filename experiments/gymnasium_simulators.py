@@ -51,9 +51,9 @@ TASKS: dict[str, list[tuple[str, dict[str, Any], int, dict[str, Any]]]] = {
 DEFAULTS = {name: getattr(rtd.Config(), name) for name in SETTING if not name.startswith("eval")}
 """The fields of the pendulum's setting, but with the values of the published TD3."""
 OWN = {
-    # An episode ends at an angle of 0.2 rad: raw readings are too small for a network. Values reach
-    # their level within thousands of updates; still, one of four seeds failed in
-    # experiments/gymnasium_search.py.
+    # An episode ends at an angle of 0.2 rad: raw readings are too small for a network. With these
+    # gamma and tau, values reach their level within thousands of updates; still, one of four seeds
+    # failed in experiments/gymnasium_search.py.
     "InvertedPendulum-v5": {
         **DEFAULTS,
         "hidden_size": 64,
@@ -102,7 +102,11 @@ def trained(task: str, index: int, episodes: int, tiny: dict[str, Any]) -> list[
 
 
 def cost(steps: int) -> dict[str, Any]:
-    """Milliseconds of a step: training on the simulator, on our pendulum, and the simulator."""
+    """Milliseconds of a step, by name.
+
+    ``simulated`` is the training on the simulator, ``own`` the training on the pendulum of this
+    package, and ``simulator`` the simulator alone.
+    """
     found: dict[str, list[float]] = {"simulated": [], "own": [], "simulator": []}
     config = rtd.Config(**{**SETTING, **FEED_FORWARD, "total_steps": steps, "eval_every": steps})
     environments = {"simulated": rtd.from_gymnasium("Pendulum-v1"), "own": rtd.make("pendulum")}

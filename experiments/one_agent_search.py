@@ -9,9 +9,10 @@ script writes experiments/results/one_agent_search.csv: a row per setting that w
 included. A setting that has a row is not trained again; `--only` names settings by their place in
 `CHANGES`.
 
-`structured` is the worst of the structured conditions, normalised (0 is the uniform-random policy,
-1 the fully observed optimum); `noise` is the same under noise, divided by that of the model-based
-reference (`experiments/filter_reference.py`), which knows what can be known.
+`structured` is the return under the worst structured condition of each seed, as a mean over seeds
+and normalised (0 is the uniform random policy, 1 the fully observed optimum). The columns of noise
+have the normalised returns under noise, divided by that of the model-based reference
+(`experiments/filter_reference.py`), a Bayes filter that knows the process.
 """
 
 import pathlib
@@ -116,7 +117,7 @@ def reference() -> dict[str, float]:
 
 
 def search(setting: dict, episodes: int) -> dict:
-    """Train the setting and test it; the results of a row."""
+    """Train the setting and test it; return the results of its row."""
     began = time.process_time()
     fields = {name: value for name, value in setting.items() if name != "disturbance"}
     env = rtd.make("pendulum", setting["disturbance"])

@@ -62,7 +62,7 @@ SEEDS = 5
 """The paper's seeds."""
 TEST_EPISODES = 1_000
 EARLIER_EPISODES = 20
-"""Values for rows of an old table without these columns."""
+"""The episodes of rows of an old table, which has no column of that name."""
 REFERENCE_EPISODES = 1_000
 FAILED = -0.1
 """An agent with a lower normalised return is worse than uniform random actions."""
@@ -136,7 +136,7 @@ def with_others(lanes: pd.DataFrame, path: pathlib.Path, column: str) -> pd.Data
 
 
 def of_each(lanes: pd.DataFrame, column: str) -> str:
-    """The value of ``column`` in most cells, and the agents that have cells with others."""
+    """The value of ``column`` in most lanes, and the agents of lanes that have other values."""
     usual = lanes[column].mode()[0]
     parts = [f"{usual:,}"]
     for value, own in lanes[lanes[column] != usual].groupby(column):

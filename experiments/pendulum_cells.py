@@ -1,7 +1,7 @@
 """The cells of the paper's figures of the pendulum, for experiments/pendulum.py.
 
 The cells are six agents under the paper's four disturbances, and `lstm-td3` with and without past
-actions under three other disturbances, for which the paper compares both; each with every window
+actions under three other disturbances, for which the paper compares both. Each has every window
 length. The settings are those of the preset `pendulum`; experiments/pendulum_search.py found them
 under `hidden`. `h-td3` has different settings, because its critics read carries that an old version
 of the actor stored.
@@ -74,7 +74,7 @@ def cells(options: argparse.Namespace, tiny: dict[str, Any]) -> list[rtd.Cell]:
 
 
 def missing(wanted: list[rtd.Cell], lanes: pd.DataFrame, seeds: Iterable[int]) -> list[rtd.Cell]:
-    """The cells of which the table ``lanes`` has not all ``seeds`` with the current settings."""
+    """The cells of which the table ``lanes`` lacks some of ``seeds`` with the current settings."""
 
     def stands(cell: rtd.Cell) -> bool:
         config = cell.config

@@ -3,11 +3,11 @@
 Usage: python experiments/pendulum_pictures.py [--run DIR] [--disturbance D] [--history-length L]
                                                [--seed N] [--agents A B] [--out DIR] [--quick]
 
-The script loads two policies of a study of experiments/pendulum.py (which trains cells that its
---out does not have), and plays the same twenty
-episodes with both. It shows the episode whose difference of returns is nearest to the mean
-difference (in the median episode, both returns are similar). It writes pendulum_swing.gif: the true
-pendulum, the observed pendulum, and below them the true and the observed angular velocity.
+The script loads two policies of a study of experiments/pendulum.py, and plays the same twenty
+episodes with both. (That script only trains cells that the table in its --out does not have.) It
+shows the episode whose difference of returns is nearest to the mean difference, because in the
+median episode, both returns are similar. It writes pendulum_swing.gif: the true pendulum, the
+observed pendulum, and below them the true and the observed angular velocity.
 """
 
 import argparse

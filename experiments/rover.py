@@ -223,7 +223,7 @@ def fine_tuned() -> list[list[str]]:
 
 
 def order(rows: pd.DataFrame) -> str:
-    """The paper's order of the agents on AR(1) slip, with a verdict for each pair."""
+    """The paper's order of the agents on AR(1) slip, with a verdict for each pair of neighbours."""
     header = ["trained on", "the paper's order: difference of means [95% interval]", "verdict"]
     body = []
     for column, (trained, tested) in list(enumerate(COLUMNS))[:2]:

@@ -4,9 +4,9 @@ Usage: python experiments/rover_lengths.py [--quick] [--run DIR] [--out DIR] [--
                                            [--lengths L ...] [--slips S ...] [--algorithms A ...]
                                            [--report]
 
-The table of experiments/rover.py has agents whose window is one past observation. This script
-trains the agents that have a window with three longer ones, with the same settings, seeds and
-steps, and tests all of them in 1,000 episodes of AR(1) slip. It writes rover_lengths.md, .parquet
+The table of experiments/rover.py has agents whose window is one past step. This script trains the
+agents that have a window with three longer windows, with the same settings, seeds and steps, and
+tests all of them in 1,000 episodes of AR(1) slip. It writes rover_lengths.md, .parquet
 (a row per policy) and .png; window 1 and `td3` are read from rover.parquet. It trains the cells
 that the table does not have yet, as a study in DIR, in the order of the lengths, slips and agents
 of the command; if you repeat the command, it only trains what is missing. `--report` does not

@@ -5,7 +5,7 @@ Usage: python experiments/rover_longer.py [--quick] [--run DIR] [--out DIR] [--a
 
 The settings are those of experiments/rover.py, with 160,000 steps instead of 80,000. The script
 trains five seeds on AR(1) slip, and tests them in the same 1,000 episodes as experiments/rover.py.
-The returns after 80,000 steps are those of rover.parquet, in --out or else of the committed one. It
+The returns after 80,000 steps are read from rover.parquet, in --out or else in the results. It
 writes rover_longer.md and .parquet (a row per policy). If you repeat the command, it only trains
 what is missing; `--report` does not train.
 """

@@ -27,7 +27,12 @@ STEPS, SECONDS_PER_STEP = 200, 0.1
 
 
 def drive(policy: rtd.Policy, env, seed: int) -> dict[str, np.ndarray]:
-    """One episode: commands, motion and slip, [T, 2] each; the slip only depends on ``seed``."""
+    """Play an episode; the slip only depends on ``seed``.
+
+    Returns:
+        Arrays [T, 2]: ``motion`` (speed in m/s, yaw rate in rad/s), ``slip`` of the wheels, and
+        ``implied``, the slip for which each command would be exact.
+    """
     params = env.default_params
     reset_key, steps_key = jax.random.split(jax.random.key(seed))
     observation, state = env.reset(reset_key, params)

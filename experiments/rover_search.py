@@ -2,7 +2,7 @@
 
 Usage: python experiments/rover_search.py [--quick] [--out FILE]
 
-All agents shall have the same settings, so the search uses the best agent of the paper,
+All agents have the same settings, so the search uses the best agent of the paper,
 `lstm-td3-1ha1hc`. The script writes experiments/results/rover_search.csv: a row per setting, with
 the mean return of the final policies on `ar1-slip` (1,000 episodes per seed) and the ceiling.
 Existing rows are not trained again.

@@ -3,10 +3,11 @@
 Usage: python experiments/rover_soil.py [--quick] [--run DIR] [--out DIR] [--steps N]
                                         [--sources S ...] [--report]
 
-Six agents, five seeds, are trained under the rover's sine and AR(1) slip, and with the same setting
-on soil (`mixed`). Beside them stand controllers that need no training. Every policy is tested in
-1,000 episodes of each ground; those of soil also under both slips. The script writes rover_soil.md,
-rover_soil.parquet (a row per policy and world), rover_soil.json, and a picture
+Six agents with five seeds each are trained under the rover's sine and AR(1) slip, and with the same
+settings on soil (`mixed`). For comparison, there are controllers that need no training. Every
+policy is tested in 1,000 episodes of each ground; policies trained on soil are also tested under
+both slips. The script writes rover_soil.md, rover_soil.parquet (a row per policy and world),
+rover_soil.json, and a picture
 (experiments/rover_soil_report.py). It trains the cells that the table does not have yet, as a study
 in DIR, in the order of `SOURCES`; if you repeat the command, also on another machine, it only
 trains what is missing. `--report` does not train: it tests what DIR has so far, also of a study
@@ -42,7 +43,7 @@ from rover_soil_report import GROUNDS, SLIPS, SOIL, UNTRAINED, draw, tables  # n
 from writing import RESULTS, parse, provenance, say, write_results  # noqa: E402
 
 SOURCES = ("sine-slip", SOIL, "ar1-slip")
-"""What agents are trained on, in an order that soon gives a useful table."""
+"""The slips and grounds of the trainings, in an order that soon gives a useful table."""
 QUICK_STEPS, QUICK_EPISODES = 60, 20
 KEY = ["algorithm", "trained_on", "tested_on", "seed"]
 COLUMNS = [*KEY, "steps", "episodes", "mean", "standard_error"]
@@ -54,12 +55,12 @@ def world(name: str) -> tuple[str, str]:
 
 
 def tests_of(source: str) -> tuple[str, ...]:
-    """What policies trained on ``source`` are tested on."""
+    """The slips and grounds on which policies trained on ``source`` are tested."""
     return (*GROUNDS, *SLIPS) if source in GROUNDS else GROUNDS
 
 
 def wanted(sources: list[str], steps: int, tiny: dict[str, object]) -> list[rtd.Cell]:
-    """A cell for each source and agent; of two agents where they are ``tiny``."""
+    """A cell for each source and agent; with ``tiny``, only for two agents."""
     agents = rtd.ALGORITHMS[:2] if tiny else rtd.ALGORITHMS
     settings = {**SETTINGS, "total_steps": steps, **tiny}
     grids = [
@@ -80,7 +81,7 @@ def has(rows: pd.DataFrame, cell: rtd.Cell, seed: int) -> bool:
 
 
 def row_of(policy: object, tested_on: str, who: tuple, episodes: int) -> dict[str, object]:
-    """Test ``policy``, which is (algorithm, trained on, seed, steps); the values of a row."""
+    """Test ``policy``, and return its row; ``who`` is (algorithm, trained on, seed, steps)."""
     algorithm, trained_on, seed, steps = who
     env = rtd.make(*world(tested_on))
     returns = np.asarray(rtd.evaluate(policy, env, episodes, seed=seed), np.float64)

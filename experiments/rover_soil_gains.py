@@ -2,9 +2,9 @@
 
 Usage: python experiments/rover_soil_gains.py [--quick] [--out DIR]
 
-A grid for the PI controller and one for the controller that estimates the slip, on `mixed-slope`,
-1,000 episodes of seed 1000, which no table reports. Writes rover_soil_gains.md, .parquet and .json;
-the best of each is what rtd3jax/envs/rover_soil/controllers.py has.
+The script tests a grid of gains of the PI controller, and of the controller that estimates the
+slip, on `mixed-slope`: 1,000 episodes of seed 1000, which no table reports. It writes
+rover_soil_gains.md, .parquet and .json. rtd3jax/envs/rover_soil/controllers.py has the best gains.
 """
 
 import argparse

@@ -5,15 +5,16 @@ Usage: python experiments/rover_soil_pull.py [--quick] [--out DIR]
 The measurements are those of Ding, Gao, Deng, Nagatani and Yoshida (J. Terramechanics 48(1), 2011,
 Figure 9) for the wheel of `rover-soil`: smooth, 157.35 mm by 165 mm, under 80 N, as roverdevkit
 (Autonomous-Mission-Systems-Lab, commit 69e1c815b635, data/validation/single_wheel_experiments.csv)
-read them from the figure. The script compares them with the model
+read them from the figure. The script compares the measurements with the predictions of the model
 
-* by the published parameters of the soil (Table 2 of the paper, from data/soil_simulants.csv of
+* with the published parameters of the soil (Table 2 of the paper, from data/soil_simulants.csv of
   the same program; K is the middle of its range); the shape of the stresses is that of loose sand;
-* with parameters that were fitted to these measurements, within the ranges that a `Soil` allows.
-  The exponent may rise with the slip, by which Ding et al. describe the sinkage of a wheel that
-  slips. In the first fit, cohesion, friction angle and K are the published ones (K within its
-  range); in the second, these are free too; in the third, also, and the pull counts ten thousand
-  times as much as torque and sinkage.
+* with parameters that were fitted to these measurements. Their bounds are within those of a `Soil`,
+  except the slope of the stress peak, which may be up to 0.6. The exponent may rise with the slip,
+  by which Ding et al. describe the sinkage of a wheel that slips. In the first fit, cohesion,
+  friction angle and K have their published values (K within its range). In the second fit, these
+  parameters are free too. The third fit is as the second, but the pull counts ten thousand times as
+  much as torque and sinkage; it counts four times as much in the other fits.
 
 A fit minimises squared relative errors of pull, torque and sinkage by scipy's `least_squares`, and
 is the best from several random starts. If all fits miss the pull, it is the model that misses it,
@@ -48,13 +49,13 @@ SINKAGE = np.array([5.0, 5.5, 7.5, 10.0, 12.5, 17.5]) * 1e-3
 MODULUS = 15.6e3 / 0.165 + 2407.4e3
 """N/m^(n+2), below a plate of the wheel's width."""
 GOAL = 0.1
-"""Relative error of the pull."""
+"""Largest relative error of a predicted pull that the last row of the table counts."""
 BISECTIONS = 24
 STARTS = 24
 
 
 class Parameters(NamedTuple):
-    """Of the soil; ``exponent_slope`` and ``exit_slope`` are changes by the slip."""
+    """Parameters of the soil; ``exponent_slope`` and ``exit_slope`` are changes by the slip."""
 
     cohesion: float | jax.Array
     """Pa"""
@@ -123,7 +124,7 @@ def errors(values: np.ndarray, weight: float) -> np.ndarray:
 def fit(low: Parameters, high: Parameters, weight: float, starts: int) -> np.ndarray:
     """The best parameters between ``low`` and ``high``; equal bounds fix a parameter.
 
-    The pull's errors have ``weight`` before they are squared.
+    The errors of the pull are multiplied by ``weight`` before they are squared.
     """
     low, high = np.array(low), np.array(high)
     free = high > low

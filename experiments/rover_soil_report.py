@@ -25,11 +25,11 @@ from writing import markdown_table, seeds_text  # noqa: E402
 SLIPS = ("ar1-slip", "sine-slip")
 GROUNDS = ("mixed", "mixed-slope", "dry-sand")
 SOIL = "mixed"
-"""The ground on which agents are trained; they are tested on all."""
+"""The ground on which agents are trained; they are tested on all grounds."""
 UNTRAINED = "no training"
-"""What controllers are trained on."""
+"""The entry of ``trained_on`` in the rows of controllers."""
 TRANSFER_SLIP = "sine-slip"
-"""The training of the paper's claim 14."""
+"""The slip on which the agents of the paper's claim 14 are trained."""
 COLOURS = {"ar1-slip": "#56B4E9", "sine-slip": "#E69F00", SOIL: "#009E73"}
 CONTROLLER_LINES = {"feed-forward and PI": "-", "adaptive slip estimate": "--"}
 
@@ -101,7 +101,10 @@ def claim_14(rows: pd.DataFrame, grounds: tuple[str, ...]) -> str:
 
 
 def against(rows: pd.DataFrame, grounds: tuple[str, ...]) -> str:
-    """What training on soil gains over each slip, and each training over the best controller."""
+    """The differences of training on soil and on each slip, and of each training and a controller.
+
+    The controller is the one with the best mean return on the ground.
+    """
     body = []
     for ground in grounds:
         plain = {name: means_of(rows, name, UNTRAINED, ground) for name in untrained(rows)}

@@ -42,8 +42,8 @@ def search_main(
 ) -> None:
     """The command line of a search: ``search(setting, episodes)`` for each of ``changes``.
 
-    With ``--quick``, only the first two, with tiny trainings; with ``--only``, those of these
-    numbers, from 0.
+    ``--only`` names settings by their places in ``changes``, from 0. ``--quick`` only goes through
+    the first two of the settings, with tiny trainings.
     """
     parser = argparse.ArgumentParser(description=description.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")

@@ -24,7 +24,7 @@ LENGTHS = (1, 10, 20)
 REPLAYS = (100_000, 1_000_000)
 GIB = 2**30
 MEMORY = {"map": 24 * GIB, "vmap": 80 * GIB}
-"""A machine of two cores, an accelerator."""
+"""Bytes of memory, by strategy: a machine with two cores (`map`), and an accelerator (`vmap`)."""
 LANES, STEPS = 10_000, 100_000
 MACHINES = (1, 10, 100)
 

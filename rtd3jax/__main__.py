@@ -20,11 +20,11 @@ _WIDTH = 79
 _FOLDER = str(pathlib.Path(__file__).parent / "cli")
 _PACKAGES = ("rtd3jax", "jax", "flax", "gymnax")
 _MARK = "``python -m rtd3jax."
-"""How the docstring of a command's module begins: then come the name, "``: " and the purpose."""
+"""The docstring of a command's module begins with this, its name, "``: " and its purpose."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; the exit status: 0 done, 2 bad input."""
+    """Print the list and return the exit status 0; bad input exits with status 2."""
     replace_unprintable()
     parser = argparse.ArgumentParser(
         prog="python -m rtd3jax",
@@ -55,7 +55,10 @@ def _lines() -> Iterator[str]:
 
 
 def commands() -> dict[str, str]:
-    """Each command's purpose: the first line of its module's docstring. No module is imported."""
+    """The purpose of each command by its name, from the docstring of its module.
+
+    No module is imported.
+    """
     found = {}
     for module in pkgutil.iter_modules([_FOLDER], "rtd3jax.cli."):
         spec = module.module_finder.find_spec(module.name, None)

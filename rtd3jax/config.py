@@ -234,7 +234,7 @@ class Config:
         if self.capacity < max(self.batch_size, window):
             each = f" of each of {self.environments} environments" if self.environments > 1 else ""
             remedy = "replay_capacity"
-            if self.replay_capacity is None:  # it follows
+            if self.replay_capacity is None:  # the capacity is then total_steps
                 remedy = f"total_steps ({self.total_steps}), which it follows"
             raise UserError(
                 f"replay_capacity ({self.capacity}) holds less than a batch "
@@ -361,13 +361,13 @@ class Config:
     @property
     def window_tokens(self) -> int:
         """Past tokens in a window: l, or 0 for an agent without a window."""
-        assert self.history_length is not None  # resolved when it was made
+        assert self.history_length is not None  # `__post_init__` has set it
         return self.history_length
 
     @property
     def acting_mode(self) -> Acting:
         """How the agent acts: with a ``window``, or with a running ``carry``."""
-        assert self.acting is not None  # resolved when it was made
+        assert self.acting is not None  # `__post_init__` has set it
         return self.acting
 
     @property
@@ -378,7 +378,7 @@ class Config:
     @property
     def segment_steps(self) -> int:
         """Consecutive transitions in a segment, m; 0 with windows."""
-        assert self.segment_length is not None  # resolved when it was made
+        assert self.segment_length is not None  # `__post_init__` has set it
         return self.segment_length
 
     @property
@@ -398,7 +398,7 @@ class Config:
 
     @property
     def first_learning_step(self) -> int:
-        """The first step of all environments after which an update is made."""
+        """Number of steps of all environments before the first update."""
         return -(-self.learning_starts // self.environments)
 
     @property
@@ -434,8 +434,8 @@ class Config:
     def from_dict(cls, fields: Mapping[str, Any]) -> "Config":
         """The configuration that `to_dict` wrote, in this version or an earlier one.
 
-        A field whose value is the default that depends on another field follows that field again:
-        an actor that starts when learning does, and a replay as large as the training is long.
+        ``actor_starts`` and ``replay_capacity`` become None again if they equal
+        ``learning_starts`` and ``total_steps``, so that they follow these fields.
 
         Raises:
             UserError: when a value is impossible.
@@ -454,7 +454,10 @@ def traced_fields() -> tuple[str, ...]:
 
 
 def _as_number(value: Any, integral: bool) -> int | float | None:
-    """``value`` as a plain Python number; None for anything else, for booleans and for NaN."""
+    """``value`` as a plain Python number; None if it is not one, is not finite, or is a boolean.
+
+    If ``integral`` is true, a number that is not whole also gives None.
+    """
     if isinstance(value, bool):
         return None
     try:

@@ -24,16 +24,16 @@ def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
 
 
 def typed_reason(error: BaseException) -> str:
-    """`short_reason` after the error's type, for errors of code of others."""
+    """The error's type, then `short_reason`; for errors that code of others raised."""
     reason, name = short_reason(error), type(error).__name__
     return reason if reason == name else f"{name}: {reason}"
 
 
 def short_reason(error: BaseException) -> str:
-    """The line of an error's message that says most, or the error's type if there is none.
+    """The most informative line of an error's message, or the error's type if it has no message.
 
-    This is the first line; of a message that holds a traceback, as those of callbacks to the host
-    do, it is the last.
+    This is the first line. If the message begins with a traceback, as messages of host callbacks
+    do, it is the last line.
     """
     lines = str(error).strip().splitlines() or [type(error).__name__]
     return lines[-1].strip() if "Traceback (most recent call last)" in lines[0] else lines[0]

@@ -22,7 +22,10 @@ class EnvironmentLike(Protocol):
     def step(
         self, key: jax.Array, state: Any, action: jax.Array, params: Any = None, /
     ) -> tuple[Any, Any, Any, Any, Any, dict]:
-        """Observation [O], state, reward [], terminated [], truncated [], info."""
+        """One step with automatic reset.
+
+        Returns observation [O], state, reward [], terminated [], truncated [] and info.
+        """
 
     def action_space(self, params: Any = None, /) -> Any:
         """The bounded Box of actions."""
@@ -40,7 +43,7 @@ class ComposableEnvironment(EnvironmentLike, Protocol):
         """Elements of an action."""
 
     def reset_env(self, key: jax.Array, params: Any, /) -> tuple[Any, Any]:
-        """As `reset`."""
+        """As `reset`, but ``params`` is required."""
 
     def step_env(
         self, key: jax.Array, state: Any, action: jax.Array, params: Any, /

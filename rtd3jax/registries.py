@@ -26,7 +26,8 @@ class Registry(Generic[Entry]):
         """Add ``entry`` under ``name``.
 
         Raises:
-            UserError: when ``name`` is not a word, or is taken while ``replace`` is false.
+            UserError: when ``name`` is empty, contains a space or one of ``/:,``, or is taken while
+                ``replace`` is false.
         """
         if not isinstance(name, str) or not name or any(c.isspace() or c in "/:," for c in name):
             raise UserError(
@@ -39,7 +40,7 @@ class Registry(Generic[Entry]):
             )
         replaced = self._entries.get(name, entry) is not entry
         self._entries[name] = entry
-        if replaced:  # programs are found by the name of what they were made of
+        if replaced:  # compiled programs are found by names, and may contain the former entry
             forget_programs()
 
     def check(self, name: object) -> None:
@@ -65,10 +66,10 @@ class Registry(Generic[Entry]):
 
 
 AGENTS: Registry[Any] = Registry("algorithm", "rtd.register_agent(name, variant)")
-"""`rtd3jax.agents.variants` fills it."""
+"""The definition of each agent; `rtd3jax.agents.variants` fills this table."""
 
 MEMORIES: Registry[Any] = Registry("memory", "rtd.register_memory(name, module)")
-"""`rtd3jax.agents.memory` fills it."""
+"""The module of each memory; `rtd3jax.agents.memory` fills this table."""
 
 LEARNERS: Registry[Any] = Registry("learner", "rtd.register_learner(name, make)")
-"""`rtd3jax.agents.learners` fills it."""
+"""A function that makes each learner; `rtd3jax.agents.learners` fills this table."""

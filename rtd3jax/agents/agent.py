@@ -37,15 +37,15 @@ class Sizes(Protocol):
 
     @property
     def observation_size(self) -> int:
-        """O."""
+        """O, the number of elements of an observation."""
 
     @property
     def action_size(self) -> int:
-        """A."""
+        """A, the number of elements of an action."""
 
     @property
     def true_observation_size(self) -> int:
-        """S: elements of the undisturbed observation; 0 if the environment does not tell it."""
+        """S, for the undisturbed observation; 0 if the environment does not give it."""
 
 
 @dataclasses.dataclass(frozen=True)

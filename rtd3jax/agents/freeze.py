@@ -1,4 +1,4 @@
-"""Parts of the networks that are not trained, such as ``actor.memory``, or not from the start."""
+"""Parts of the networks whose weights an update does not change: frozen parts, a waiting actor."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence

@@ -94,7 +94,7 @@ class Segment:
 
     @property
     def length(self) -> int:
-        """m."""
+        """m, the number of the segment's steps without the burn-in."""
         return self.observation.shape[0] // self.starts.shape[1]
 
     @property

@@ -225,8 +225,8 @@ def store(
     replay = put_transitions(replay, first, rows)
     if replay.carries is None:
         return replay
-    # Within an episode, the carry of the next step overwrites this slot. Lanes side by side (vmap)
-    # compute the final carries at every step: one pass over windows, beside those of the updates.
+    # Within an episode, the carry of the next step overwrites this slot. Under vmap, lanes compute
+    # the final carries at every step, which is one more pass over windows than the updates need.
     carry = jax.lax.cond(
         jnp.any(done),
         final_carry,

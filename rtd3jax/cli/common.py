@@ -33,7 +33,8 @@ def exit_status(
         interrupted: returns the status after an interrupt, for which a line is printed.
 
     Returns:
-        what ``work`` returns; 2, after one line on stderr, if the input or a file is at fault.
+        what ``work`` returns; 2, after one line on stderr, if the input or a file is at fault; what
+        ``interrupted`` returns, after an interrupt; 0 if the reader of the output has ended.
     """
     try:
         return work()
@@ -46,8 +47,8 @@ def exit_status(
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
     except OSError as error:
-        # A full disk, for example. Files that were written before it are complete, and the same
-        # command continues from them.
+        # A full disk, for example. Files that were written before the error are complete, and the
+        # same command continues from them.
         print(f"error: {error.filename or place()}: {error.strerror or error}", file=sys.stderr)
     return 2
 

@@ -1,7 +1,8 @@
 """``python -m rtd3jax.compare RUN_A RUN_B ...``: compare returns of runs in their common cells.
 
-The first run is the baseline. Differences are paired if both runs have the same seeds. The command
-prints a Markdown table; with --out DIR it also writes DIR/compare.parquet and DIR/compare.md.
+The first run is the baseline. Differences are paired if both runs have at least two equal seeds.
+The command prints a Markdown table; with --out DIR it also writes DIR/compare.parquet and
+DIR/compare.md.
 """
 
 import argparse
@@ -41,7 +42,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _short_names(paths: list[str]) -> list[str]:
-    """The last parts of each path: the fewest that make all names different."""
+    """The last parts of each path: as few parts as make all names different."""
     parts = [path.replace("\\", "/").split("/") for path in paths]
     for count in range(1, max(map(len, parts)) + 1):
         names = ["/".join(part[-count:]) for part in parts]

@@ -52,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     before = _on_termination(_terminate)
     try:
-        # Not of interrupts during the training, after which results follow.
+        # Interrupts during the training do not arrive here: `run_study` handles them.
         return exit_status(
             lambda: _start(options, arguments), lambda: sweep_options.out(options), _status_of
         )
@@ -103,7 +103,7 @@ class _Plan:
         directory: the run directory, in which nothing is written yet.
         jobs: a job for each lane of the study, also for those that have ended.
         strategy: ``map`` or ``vmap``.
-        interval: between checkpoints, (seconds, steps).
+        interval: (seconds, steps) between checkpoints.
         shard: the share of this process, if the lanes are divided by ``--shard``.
         shares: how processes of this machine divide the lanes.
         additions: a message about what is added to an existing study.
@@ -200,7 +200,10 @@ def _shard(options: argparse.Namespace) -> tuple[int, int] | None:
 def _share(
     jobs: list[Job], shard: tuple[int, int] | None, options: argparse.Namespace
 ) -> list[Job]:
-    """The lanes of a shard: every n-th, so that all shards take about the same time."""
+    """The lanes of this process.
+
+    A shard has every n-th lane, so that all shards take about the same time.
+    """
     if options.distributed:
         return own_share(jobs)
     return jobs if shard is None else jobs[shard[0] - 1 :: shard[1]]

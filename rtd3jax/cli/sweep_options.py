@@ -149,7 +149,7 @@ def parser(description: str | None) -> argparse.ArgumentParser:
 
 
 def _kind(hint: object) -> type:
-    """The type that a field of this type reads from the command line: text, or a number."""
+    """The type of a flag's value for a field with the type ``hint``: text, or a number."""
     if get_origin(hint) is Literal:
         return str
     parts = [part for part in get_args(hint) if part is not type(None)]
@@ -160,7 +160,11 @@ def _kind(hint: object) -> type:
 
 
 def grids(options: argparse.Namespace) -> list[Grid]:
-    """The grids of the preset, in which lists from the command line replace the preset's lists."""
+    """The grids of the preset, in which lists from the command line replace the preset's lists.
+
+    Raises:
+        UserError: when neither a preset nor an environment is named, or both disagree.
+    """
     if options.preset is None and options.env is None:
         raise UserError("choose what to run: --preset quick, or --env with --algorithms")
     if options.preset is None:
@@ -189,7 +193,7 @@ def overrides(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def out(options: argparse.Namespace) -> Path:
-    """The run directory."""
+    """The run directory; UserError if no option determines it."""
     given = out_path(options.out)
     if not (given or options.preset or options.env):
         raise UserError("name the run directory: --out DIR")
@@ -204,7 +208,7 @@ def count(name: str, value: int) -> int:
 
 
 def device(platform: str) -> Any:
-    """The first device of a platform."""
+    """The first device of a platform; UserError if there is none."""
     try:
         return jax.local_devices(backend=platform)[0]
     except RuntimeError as error:
@@ -215,7 +219,13 @@ def device(platform: str) -> Any:
 
 
 def parse_interval(text: str) -> tuple[float | None, int | None]:
-    """``"300s"``, ``"5m"`` or ``"2000steps"`` as (seconds, None) or (infinity, steps)."""
+    """``"300s"``, ``"5m"`` or ``"2000steps"`` as (seconds, None) or (infinity, steps).
+
+    The result for ``"auto"`` is (None, None).
+
+    Raises:
+        UserError: for any other form.
+    """
     if text == "auto":
         return None, None
     match = re.fullmatch(r"(\d{1,9})\s*(s|m|h|steps)?", text.strip())

@@ -14,4 +14,4 @@ DISTURBANCES: dict[str, tuple[str, ...]] = {env: disturbances_of(env) for env in
 Several are joined by ``+``, for example ``ar1-slip+dropout``."""
 
 LISTED: dict[str, tuple[str, ...]] = {**DISTURBANCES, "rover-soil": disturbances_of("rover-soil")}
-"""The disturbances of all environments of this package, for lists of what there is."""
+"""The disturbances of all environments of this package, for example for ``python -m rtd3jax``."""

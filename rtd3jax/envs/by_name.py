@@ -20,7 +20,13 @@ from rtd3jax.errors import UserError, nearest
 def disturbed_by_name(
     env_id: str, entry: Registered, disturbance: str, parameters: dict[str, Any]
 ) -> Any:
-    """The entry's environment with its disturbances; each parameter goes to the one that has it."""
+    """The environment of ``entry`` under ``disturbance``, with ``parameters``.
+
+    Each parameter goes to the named disturbance that has it, or else to the environment.
+
+    Raises:
+        UserError: for an unknown disturbance or parameter, or an impossible value.
+    """
     base: Any = entry.env
     alternatives = [alternative.split("+") for alternative in disturbance.split("/")]
     names = [name for alternative in alternatives for name in alternative]

@@ -35,10 +35,10 @@ LARGEST, SMALLEST = 1e2, 1e-3
 """A network learns well from numbers whose root mean square lies between these bounds."""
 
 _DIGITS = 1e-5
-"""Relative difference that two compilations of one program may have."""
+"""Largest relative difference that counts as the rounding of two compilations of one program."""
 
 AFTER_RESET = 8
-"""Steps for which two new episodes are compared."""
+"""Steps for which `_leaks` compares two new episodes."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,8 +47,8 @@ class Finding:
 
     Attributes:
         kind: ``interface`` (every training refuses the environment), ``dtype``, ``space``,
-            ``vmap``, ``finite``, ``pure``, ``leak``, ``final-observation``, ``time-limit``, or
-            ``scale``.
+            ``vmap``, ``simulator``, ``finite``, ``pure``, ``leak``, ``final-observation``,
+            ``time-limit``, or ``scale``.
         problem: what is wrong.
         remedy: what to do.
         advice: true if the environment is correct, but training on it will probably be poor.
@@ -76,7 +76,8 @@ def check_env(env: EnvironmentLike, *, params: object = None, seed: int = 0) -> 
         seed: seed of the episodes and actions.
 
     Raises:
-        UserError: listing every `Finding` with its remedy; several findings are on separate lines.
+        UserError: listing every `Finding` that is not advice, with its remedy; several findings are
+            on separate lines.
     """
     found, name = _findings(env, params, seed), environment_name(env)
     for finding in found:
@@ -98,7 +99,7 @@ def check_env(env: EnvironmentLike, *, params: object = None, seed: int = 0) -> 
 
 
 def find_problems(env: EnvironmentLike, *, params: object = None, seed: int = 0) -> list[Finding]:
-    """The findings of `check_env` as a list, which is empty for a correct environment."""
+    """The findings of `check_env` except advice; an empty list for a correct environment."""
     return [finding for finding in _findings(env, params, seed) if not finding.advice]
 
 
@@ -189,13 +190,15 @@ def _played(
 
 @dataclasses.dataclass
 class _Record:
-    """The first E = 8 episodes, of up to T steps each; numpy arrays, except for the states.
+    """T steps of E = 8 copies of the environment; numpy arrays, except for the states.
+
+    When an episode ends, the automatic reset begins another one.
 
     Attributes:
         first: [E, O], the observations of reset.
         seen, final: [E, T, O], the observations of step, and ``final_observation`` of info.
         reward, terminated, truncated: [E, T].
-        last_state: [E, ...], the state before the last step that was played of the episode.
+        last_state: [E, ...], the state before the last played step of the first episode.
         last_action: [E, ...], the action of this step.
     """
 
@@ -210,13 +213,13 @@ class _Record:
 
     @property
     def length(self) -> np.ndarray:
-        """int [E], steps of the episode; T + 1 if the episode did not end."""
+        """int [E], steps of the first episode; T + 1 if it did not end."""
         done = self.terminated | self.truncated
         return np.where(done.any(1), done.argmax(1) + 1, done.shape[1] + 1)
 
     @property
     def ended(self) -> np.ndarray:
-        """bool [E]: whether the episode ended."""
+        """bool [E]: whether the first episode ended."""
         return (self.terminated | self.truncated).any(1)
 
 
@@ -315,7 +318,8 @@ def _pure(env: EnvironmentLike, params: object, record: _Record, seed: int) -> I
 
     results = []
     # The setting changes no number here. But it is part of the key under which JAX caches programs,
-    # so JAX runs the Python code again, and a value from outside the arguments shows.
+    # so JAX runs the Python code again. A result that depends on other values than the arguments
+    # then differs.
     for rank_promotion in ("allow", "warn"):
         with warnings.catch_warnings(), jax.numpy_rank_promotion(rank_promotion):
             warnings.simplefilter("ignore")
@@ -365,7 +369,8 @@ def _time_limits(record: _Record, limit: int | None, steps: int) -> Iterator[Fin
 def _final_observations(record: _Record) -> Iterator[Finding]:
     """Finds a ``final_observation`` that is not the observation before the automatic reset."""
     done = record.terminated | record.truncated
-    # XLA may compute the two in different fusions. `_finite` reports an infinite one.
+    # XLA may compute the two observations in different fusions, so their last digits may differ.
+    # `_finite` reports infinite observations.
     size = np.max(np.abs(record.final), axis=(0, 1), initial=0.0, where=np.isfinite(record.final))
     alike = np.isclose(record.final, record.seen, rtol=0, atol=_DIGITS * size, equal_nan=True)
     inside, same = ~done, np.all(alike, axis=-1)

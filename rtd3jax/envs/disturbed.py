@@ -75,10 +75,10 @@ class Disturbed(ValueIdentity, environment.Environment):
     """``base`` with observation, action and reward passed through the processes of ``params``.
 
     The observation's process receives the first observation of an episode and the observation after
-    each step, including the final one. After an automatic reset, a newly drawn process receives the
-    observation. The disturbed observation never enters the dynamics. The dynamics receive the
-    disturbed action, so the reward also charges for the disturbed action; the wrapped environment
-    limits this action as it limits any action.
+    each step, including the final one. After an automatic reset, the process is drawn again and
+    receives the first observation of the new episode. The disturbed observation never enters the
+    dynamics. The dynamics receive the disturbed action, so the reward also depends on the disturbed
+    action; the wrapped environment limits this action as it limits any action.
 
     With ``reward_from="observation"``, the reward is computed from the observation that the agent
     received before it acted (the paper's ``noise`` case); the reward's process acts after this.
@@ -141,7 +141,10 @@ class Disturbed(ValueIdentity, environment.Environment):
     def reset_where(
         self, where: jax.Array, key: jax.Array, state: DisturbedState, params: DisturbedParams
     ) -> tuple[jax.Array, DisturbedState]:
-        """As `reset_env`, for a simulator, which is reset only if ``where`` is true."""
+        """The state of a simulator's new episode; the simulator is reset only if ``where`` is true.
+
+        The arguments and results are otherwise those of `reset_env`.
+        """
         key_env, *keys = jax.random.split(key, 3)
         first, env = self.base.reset_where(where, key_env, state.env, params.env)
         return self._begin_episode(keys, first, env, params)
@@ -326,7 +329,7 @@ def with_true_reward(env: EnvironmentLike) -> EnvironmentLike:
 
 
 def warn_if_it_begins_too_late(env: Disturbed) -> None:
-    """Warn of processes that begin within the episode, if its time limit is not known."""
+    """Warn about processes that begin at a random step, if the time limit is not known."""
     own = env.default_params
     limit = getattr(own.env, "max_steps_in_episode", None)
     if limit is not None and not (is_simulated(env.base) and limit == DEFAULT_STEP_LIMIT):
@@ -347,7 +350,7 @@ def warn_if_it_begins_too_late(env: Disturbed) -> None:
 
 
 def acting_processes(params: DisturbedParams) -> list[Process]:
-    """The processes of all channels, without combinations of them and without `NoDisturbance`."""
+    """The processes of all channels: the members of combinations, without `NoDisturbance`."""
 
     def members(process: Process) -> list[Process]:
         inner = getattr(process, "processes", None)

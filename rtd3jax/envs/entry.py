@@ -46,7 +46,7 @@ def parameters_of(env: EnvironmentLike, params: object = None) -> Any:
 
 
 def _check_kind(env: Any, params: object) -> None:
-    """Raise UserError for parameters of the plant inside of ``env``, or that JAX cannot trace."""
+    """Raise UserError if ``params`` belong to the wrapped environment, or JAX cannot trace them."""
     own = getattr(env, "default_params", None)
     if hasattr(env, "base") and hasattr(own, "env") and not hasattr(params, "env"):
         raise UserError(
@@ -61,7 +61,7 @@ def _check_kind(env: Any, params: object) -> None:
 
 
 def own_parameters(env: EnvironmentLike, params: object = None) -> Any:
-    """As `parameters_of`, without the checks of disturbances and of JAX's switches."""
+    """As `parameters_of`, without the checks of disturbances, parameters and JAX's switches."""
     check_gymnax(env)
     if params is not None:
         _check_kind(env, params)

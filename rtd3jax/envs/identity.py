@@ -69,9 +69,10 @@ _WORDS = (str, bool, int, float)
 
 
 def in_words(thing: object) -> str:
-    """All that distinguishes environments or parameters except numbers, equal in every process.
+    """A text of everything except numeric parameters that distinguishes environments or parameters.
 
-    These are the types, an environment's static options, and the static fields of parameters.
+    It contains the types, an environment's static options, and the static fields of parameters. The
+    text is the same in every process.
     """
     name = type(thing).__qualname__
     if isinstance(thing, ValueIdentity):
@@ -93,7 +94,7 @@ def in_words(thing: object) -> str:
 
 
 def _fields(thing: Any) -> Iterator[str]:
-    """The fields of a dataclass in words, without those that are numbers of the plant."""
+    """The fields of a dataclass in words, without the numeric parameters of the plant."""
     for field in dataclasses.fields(thing):
         value = getattr(thing, field.name)
         static = field.metadata.get("pytree_node") is False

@@ -29,7 +29,7 @@ class Interface:
     action_high: np.ndarray
     """float32 [A]"""
     true_observation_size: int = 0
-    """S; 0 if the environment does not tell the undisturbed observation"""
+    """S; 0 if the environment does not give the undisturbed observation"""
 
     @property
     def sizes(self) -> tuple[int, int]:
@@ -50,7 +50,7 @@ class Survey:
 
     interface: Interface | None
     problems: list[UserError]
-    """The most serious first; an environment with a problem cannot be trained on."""
+    """In the order of the checks; an environment with a problem cannot be trained on."""
     reset: tuple[Any, Any] | None
     """Shapes of (observation, state)."""
     step: tuple | None
@@ -148,7 +148,7 @@ def check_hashable(env: object) -> None:
 
 
 def _true_observation_size(env: object, info: object) -> int:
-    """S, if the environment tells the undisturbed observation of a state and in info; else 0."""
+    """S, if the environment gives the undisturbed observation of a state and in info; else 0."""
     told = info.get("true_observation") if isinstance(info, dict) else None
     shape: tuple[int, ...] = getattr(told, "shape", ())
     return shape[0] if hasattr(env, "true_observation") and len(shape) == 1 else 0

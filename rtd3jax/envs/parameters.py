@@ -14,6 +14,9 @@ def parse_disturbance(text: str) -> tuple[str, dict[str, Any]]:
     """Parse ``"noise:sigma=1.0,reward_from=state"`` into a name and its parameters.
 
     A value is read as a Python literal (``elements=(0,1)``) if possible, else as a string.
+
+    Raises:
+        UserError: for a text of another form.
     """
     if not isinstance(text, str):
         raise UserError(f"a disturbance is a name such as 'none', not {text!r}")
@@ -41,6 +44,9 @@ def assign(
     """Give each parameter to the first owner that has it; return the changed owners.
 
     ``also`` names parameters that are known but handled elsewhere, for the hint in the message.
+
+    Raises:
+        UserError: for a parameter that no owner has, or a value of the wrong type.
     """
     changes: list[dict[str, Any]] = [{} for _ in owners]
     fields = [settable(owner) for owner in owners]

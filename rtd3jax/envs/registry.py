@@ -166,6 +166,7 @@ def register(
     check_extras(env_id, env, entry)
     factors = factor_stresses(env_id, own_parameters(env), entry.positive, description.stresses)
     description = dataclasses.replace(description, stresses=(*description.stresses, *factors))
+    # Another id of a registered environment takes the parts that are not given from its entry.
     known = next(
         (
             other.description

@@ -54,7 +54,7 @@ class Stress:
             raise UserError(
                 f"stress {self.name}: values={self.values!r} must be a tuple of finite numbers"
             )
-        object.__setattr__(self, "values", tuple(dict.fromkeys(values)))  # 0.1 and 0.10 are one
+        object.__setattr__(self, "values", tuple(dict.fromkeys(values)))  # each value once
         object.__setattr__(self, "quantity", self.quantity or self.name)
 
 
@@ -85,7 +85,7 @@ def _dropout(params: object, p: float) -> Impairment:
 def _delay(params: object, steps: float) -> Impairment:
     if steps != int(steps):
         raise UserError(f"a delay of {steps:g} steps must be a whole number")
-    # Powers of two: longer delays need few programs.
+    # The length of the queue is a power of two, so that few programs serve all longer delays.
     longest = max(SHORTEST_QUEUE, 1 << (max(int(steps), 1) - 1).bit_length())
     return Impairment(delay=VariableDelay(int(steps), longest=longest))
 

@@ -24,7 +24,7 @@ def ceiling(
         env_id: the id of the environment; by default the id of an equal environment.
 
     Raises:
-        UserError: for an environment whose ceiling is not known.
+        UserError: for an environment whose ceiling is not known, or when its computation fails.
     """
     best_return = description_of(env, env_id).ceiling
     name = environment_name(env)

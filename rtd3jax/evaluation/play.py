@@ -1,4 +1,4 @@
-"""How episodes begin and go on, for their returns and for their steps."""
+"""The start and the steps of episodes, which the modules `returns` and `rollout` share."""
 
 from typing import Any
 
@@ -40,8 +40,8 @@ def begin_episodes(
     For use under jit.
     """
     # With partitionable threefry, JAX's default, split(key, 3)[i] is fold_in(key, i). So with the
-    # seed of a lane, one of the episodes meets the disturbance of the lane's first episode, or as
-    # many as the lane has environments. Other keys would change every published return.
+    # seed of a lane that has E environments, E of the episodes meet the disturbances of the lane's
+    # first episodes. Other keys would change every published return.
     policy_key, reset_key, step_key = jax.random.split(key, 3)
     with foreign_code():
         observation, state = jax.vmap(env.reset, in_axes=(0, None))(
@@ -59,9 +59,13 @@ def take_step(
     state: Any,
     action: jax.Array,
 ) -> tuple[jax.Array, Any, jax.Array, jax.Array, jax.Array, dict[str, Any]]:
-    """Step ``time`` of each episode: observations, states, rewards, both kinds of ends, and info.
+    """Step ``time`` of each episode with ``action`` [episodes, ...].
 
-    Observations and rewards are float32, and ends bool. For use under jit.
+    For use under jit.
+
+    Returns:
+        Observations, float32 [episodes, O]; states; rewards, float32 [episodes]; terminated and
+        truncated, bool [episodes]; and info.
     """
     keys = jax.random.split(jax.random.fold_in(key, time), action.shape[0])
     with foreign_code():

@@ -35,7 +35,7 @@ MEASURED = (
     "true_standard_error",
     "episodes",
 )
-"""What is known of a policy under one value of a stress: the columns of `rows_of`."""
+"""The columns of `rows_of`: a value of a stress, and the returns of a policy under it."""
 
 COLUMNS = ("policy", *MEASURED)
 """Columns of a table of robustness; a row per policy, stress and value."""
@@ -171,7 +171,7 @@ def check_policy(policy: PolicyLike, cases: Sequence[Case], what: str = "") -> N
 def rows_of(
     policy: PolicyLike, cases: Sequence[Case], episodes: int, seed: int
 ) -> Iterator[dict[str, Any]]:
-    """The rows of one policy, without its name."""
+    """A row for each case, with the columns `MEASURED`."""
     for case in cases:
         returns, true = case.returns(policy, episodes, seed)
         yield {
@@ -212,7 +212,11 @@ def _stress(item: str | Stress, known: Sequence[Stress], where: str) -> Stress:
 
 
 def _case(nominal: Case) -> Case:
-    """The case of ``nominal.value``: what the stress changes, in the place of what it replaces."""
+    """``nominal`` with the change of its stress: other parameters, a process, or an environment.
+
+    Raises:
+        UserError: when the stress cannot be applied with this value.
+    """
     stress, value, env = nominal.stress, nominal.value, nominal.env
     is_wrapped = isinstance(env, Disturbed)
     plant = nominal.params.env if is_wrapped else nominal.params

@@ -81,7 +81,7 @@ def _draw(axes: "Axes", rows: "pd.DataFrame", styles: dict[str, dict[str, Any]])
 
 
 def _styles(policies: list[str]) -> dict[str, dict[str, Any]]:
-    """Colour and line style of each policy; no two policies have both in common."""
+    """Colour and line style of each policy; up to four policies of one colour differ in style."""
     found: dict[str, dict[str, Any]] = {}
     used: dict[str, int] = {}
     agents = {name: _agent_of(name) for name in policies}

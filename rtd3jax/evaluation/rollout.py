@@ -96,8 +96,8 @@ class Trajectory:
         reward``, ``terminated``, ``truncated``, and the names of the hidden variable, such as
         ``slip left``.
 
-        The last row of an episode holds the final observation; the other columns are NaN, because
-        no action follows it.
+        The last row of an episode holds the final observation. No action follows it, so its action,
+        rewards and hidden variable are NaN, and ``terminated`` and ``truncated`` are False.
         """
         import pandas as pd
 
@@ -277,7 +277,7 @@ def _trajectory(
         action_high=own.action_high,
         observation_names=tuple(names),
         seen_names=tuple(
-            # Names of their own where it is not known which elements a process leaves.
+            # Numbered names if it is not known which elements a process leaves.
             [names[k] for k in elements] if len(elements) == size else element_names((), "s", size)
         ),
         action_names=tuple(element_names(drawing.action, "a", played["action"].shape[-1])),

@@ -43,7 +43,7 @@ value contributes a probability |
     | "sine" | `SineSlip` | slip, 0 to 1 | least squares of each wave, the period by its profile |
     | "ornstein-uhlenbeck" | `OrnsteinUhlenbeck` | an offset | maximum likelihood given each first \
 value |
-    | "noise" | `GaussianNoise` | an offset | maximum likelihood; the process has no mean |
+    | "noise" | `GaussianNoise` | an offset | maximum likelihood; the process has zero mean |
 
     Args:
         log: a log as for `rtd3jax.Recorded`, or a `rtd3jax.Recorded`, such as the first part of a

@@ -24,7 +24,7 @@ MOST_ROWS = 1_000
 def played(process: Process, steps: int, size: int, episodes: int, seed: int) -> np.ndarray:
     """Simulated offsets [episodes, steps, size] of a process, or slips [episodes, steps, 2]."""
     if isinstance(process, Ar1Slip | SineSlip):
-        size = WHEELS  # whatever the log holds: its elements are equal in distribution
+        size = WHEELS  # for a log of any size: all its elements have the same distribution
     ones = jnp.ones((size,), jnp.float32)
     still = jnp.zeros((size,), jnp.float32)
 

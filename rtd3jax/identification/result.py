@@ -28,7 +28,8 @@ class Fit:
         kind: "ar1", "sine", "ornstein-uhlenbeck" or "noise".
         process: the process with the estimated parameters.
         estimates: estimates by name; a field of the process has the same name.
-        log_likelihood: log-likelihood of the values, given their previous values.
+        log_likelihood: log-likelihood of all values except the first of each sequence; for "ar1"
+            and "ornstein-uhlenbeck", given the previous values.
         parameters: number of estimated parameters.
         error: root mean square residual, in the log's unit: the error of predicting a value from
             the previous value; for "sine", the error of the fitted waves.

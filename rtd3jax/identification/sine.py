@@ -1,4 +1,4 @@
-"""The rover's slip that goes in waves."""
+"""Fits the rover's sinusoidal slip."""
 
 import math
 from collections.abc import Sequence
@@ -16,21 +16,25 @@ if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
 
 SHORTEST = 8
-"""Rows with which a wave of three parameters and an offset can be told from noise."""
+"""Fewest rows of a wave that is fitted: a wave has three parameters and an offset."""
 TRIED = 3
-"""Periods from which the least squares start: the best of the profile."""
+"""Number of initial periods for the least squares: the best ones of the profile."""
 _FINENESS = 8
-"""Periods of the profile for each cycle more that the wave may have."""
+"""Number of periods in the profile from k to k + 1 cycles in a recording."""
 
 
 def fit_sine(parts: Sequence[np.ndarray], max_slip: float | None = None) -> Fit:
-    """`SineSlip`: a wave of its own for every recording and element, and one offset.
+    """Fit `SineSlip`: a separate wave for each element of each recording, and one offset for all.
 
-    The period is where the squares of a line in sine and cosine are least; from there the clipped
-    wave is fitted by nonlinear least squares. The offsets of all waves are averaged with the
-    weights of their errors, and the waves are fitted again about it. The process draws amplitudes
-    and periods between the least and the greatest found. Its waves have no noise: ``deviation`` is
-    what they leave unexplained.
+    A linear regression on sine and cosine, for each period of a grid, gives the initial period of a
+    wave. Then nonlinear least squares fit the clipped wave. The offset of the process is the mean
+    of all waves' offsets, weighted by their inverse variances, and the waves are fitted again with
+    this offset. The process draws amplitudes and periods between the smallest and the largest of
+    the log. Its waves have no noise; the estimate ``deviation`` is the standard deviation of the
+    residuals.
+
+    Raises:
+        UserError: when the log is not slip, or no recording is long enough.
     """
     slip, bound, _ = bounded_slip("sine", parts, max_slip)
     every = [part[:, k] for part in slip for k in range(part.shape[1])]
@@ -58,7 +62,7 @@ def fit_sine(parts: Sequence[np.ndarray], max_slip: float | None = None) -> Fit:
     count = len(fits)
 
     def average(values: np.ndarray, alone: float) -> Estimate:
-        """The mean over the waves; its error includes how much they differ."""
+        """The mean over the waves; its standard error includes the differences of the waves."""
         error = alone if count == 1 else float(values.std(ddof=1)) / math.sqrt(count)
         return Estimate(float(values.mean()), error)
 
@@ -115,14 +119,14 @@ def fit_sine(parts: Sequence[np.ndarray], max_slip: float | None = None) -> Fit:
 
 
 def _wave(parameters: np.ndarray, time: np.ndarray, bound: float) -> np.ndarray:
-    """Slip [T] of (sine's part, cosine's part, angle per step, offset)."""
+    """Slip [T] for (factor of the sine, factor of the cosine, angle per step, offset)."""
     sine, cosine, angle, offset = parameters
     wave = sine * np.sin(angle * time) + cosine * np.cos(angle * time) + offset
     return np.clip(wave, 0.0, bound)
 
 
 def _slopes(parameters: np.ndarray, time: np.ndarray, bound: float) -> np.ndarray:
-    """Derivatives [T, 4] of `_wave`; zero where it is clipped."""
+    """Derivatives [T, 4] of `_wave` by its parameters; zero where the wave is clipped."""
     sine, cosine, angle, offset = parameters
     up, across = np.sin(angle * time), np.cos(angle * time)
     wave = sine * up + cosine * across + offset
@@ -132,7 +136,7 @@ def _slopes(parameters: np.ndarray, time: np.ndarray, bound: float) -> np.ndarra
 
 
 def _fit_wave(wave: np.ndarray, bound: float) -> "OptimizeResult":
-    """The least squares of (sine, cosine, angle, offset), from the best of several periods."""
+    """The least-squares fit of (sine, cosine, angle, offset): the best one of several starts."""
     from scipy.optimize import least_squares
 
     time = np.arange(len(wave), dtype=np.float64)
@@ -151,7 +155,7 @@ def _fit_wave(wave: np.ndarray, bound: float) -> "OptimizeResult":
 
 
 def _refit(wave: np.ndarray, bound: float, start: np.ndarray, offset: float) -> "OptimizeResult":
-    """The same of (sine, cosine, angle) about a known offset."""
+    """As `_fit_wave`, of (sine, cosine, angle) for a known ``offset``, from one ``start``."""
     from scipy.optimize import least_squares
 
     time = np.arange(len(wave), dtype=np.float64)
@@ -166,39 +170,39 @@ def _refit(wave: np.ndarray, bound: float, start: np.ndarray, offset: float) -> 
 
 
 def _limits(time: np.ndarray, bound: float) -> tuple[np.ndarray, np.ndarray]:
-    """Limits of a wave of slip. Without limits, half a wave of any height fits a slope."""
+    """Limits of a wave's parameters. Without them, half a wave of any amplitude fits a line."""
     slowest = np.pi / len(time)
     low, high = [-bound, -bound, slowest, -bound], [bound, bound, np.pi, 2.0 * bound]
     return np.array(low), np.array(high)
 
 
 def _starts(wave: np.ndarray) -> list[np.ndarray]:
-    """Parameters at the lowest dips of the profile over the period, from 3 steps to twice all."""
+    """The parameters at the best periods of the profile, at most ``TRIED``."""
     angles, coefficients, explained = _profile(wave)
     centre = wave.mean()
     sides = np.concatenate([[-np.inf], explained, [-np.inf]])
     peaks = np.flatnonzero((explained >= sides[:-2]) & (explained >= sides[2:]))
-    # A dip that is half as deep as the lowest is the window's, or another wave's.
+    # A peak below half of the highest one is a side lobe, or belongs to another wave.
     peaks = peaks[explained[peaks] >= 0.5 * explained.max()]
     best = peaks[np.argsort(-explained[peaks])][:TRIED]
     return [np.array([*coefficients[p][:2], angles[p], coefficients[p][2] + centre]) for p in best]
 
 
 def _profile(wave: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The line in sine and cosine that explains most of a ``wave`` [T], for each of P periods.
+    """The regressions of ``wave`` [T] on sine and cosine, for P periods from 3 steps to 2 T.
 
-    The periods lie an eighth of a cycle apart, so that all sums over the rows stand in a Fourier
-    transform of the wave, padded to eight times its length: memory grows with T, not with P T.
+    The periods lie an eighth of a cycle apart. So all sums over the rows are elements of a Fourier
+    transform of the wave, padded to eight times its length, and memory grows with T, not with P T.
 
     Returns:
-        angle per step [P]; coefficients [P, 3] of sine, cosine and one, about the wave's mean; how
-        much of the sum of squares each explains [P].
+        The angle per step [P]; the coefficients [P, 3] of sine, cosine and one, for the wave minus
+        its mean; the part of the sum of squares that each regression explains [P].
     """
     count = len(wave)
     bins = np.arange(4, math.ceil(_FINENESS * count / 3.0))
     sums = np.fft.fft(wave - wave.mean(), _FINENESS * count)
     ones = np.fft.fft(np.ones(count), _FINENESS * count)
-    # The transform turns the other way: its imaginary part is minus the sum of sines.
+    # The transform has the factor exp(-i angle t): its imaginary part is minus the sum of sines.
     right = np.stack([-sums[bins].imag, sums[bins].real, np.full(len(bins), sums[0].real)], axis=1)
     sine, cosine, twice = -ones[bins].imag, ones[bins].real, ones[2 * bins]
     both = -0.5 * twice.imag
@@ -214,12 +218,12 @@ def _profile(wave: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _variance(residuals: Sequence[np.ndarray], parameters: int) -> float:
-    """The variance of the residuals; each wave takes ``parameters`` degrees of freedom."""
+    """The variance of the residuals; each wave uses ``parameters`` degrees of freedom."""
     freedom = sum(len(part) - parameters for part in residuals)
     return max(sum(float(part @ part) for part in residuals) / freedom, 1e-16)
 
 
 def _covariance(slopes: np.ndarray, variance: float) -> np.ndarray:
-    """The covariance of the estimates of least squares."""
-    # A wave that is clipped throughout says nothing: it has no weight, rather than all of it.
+    """The covariance matrix of least-squares estimates, from their derivatives ``slopes``."""
+    # The added term gives a wave that is clipped everywhere a large variance, so no weight.
     return variance * np.linalg.inv(slopes.T @ slopes + 1e-12 * np.eye(slopes.shape[1]))

@@ -1,4 +1,4 @@
-"""Policies that need no training, with which every table compares."""
+"""Policies that need no training; tables compare trained agents with them."""
 
 import jax
 import jax.numpy as jnp
@@ -47,7 +47,11 @@ class RandomPolicy:
 
 
 def constant_policy(action: ArrayLike) -> ConstantPolicy:
-    """The policy with the constant ``action``: a number or [A] in the environment's units."""
+    """The policy with the constant ``action``: a number or [A] in the environment's units.
+
+    Raises:
+        UserError: when the action is not finite.
+    """
     array = jnp.atleast_1d(jnp.asarray(action, jnp.float32))
     if not bool(jnp.all(jnp.isfinite(array))):
         raise UserError(f"a constant policy needs finite actions, not {action!r}")
@@ -55,7 +59,11 @@ def constant_policy(action: ArrayLike) -> ConstantPolicy:
 
 
 def random_policy(env: EnvironmentLike, params: object = None) -> RandomPolicy:
-    """The uniform random policy of ``env``, the lowest reference of every table."""
+    """The policy with uniform random actions in ``env``, a reference of every table.
+
+    Raises:
+        UserError: for an unsuitable environment.
+    """
     interface = describe(env, parameters_of(env, params))
     bounds = Bounds(jnp.asarray(interface.action_low), jnp.asarray(interface.action_high))
     return RandomPolicy(bounds, interface.action_shape)

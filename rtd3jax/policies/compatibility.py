@@ -29,7 +29,8 @@ def check_compatible(
         high: highest action; any shape with the same number of elements.
 
     Raises:
-        UserError: naming both shapes, if observations or actions differ.
+        UserError: if ``policy`` is not a policy; naming both shapes, if observations or actions
+            differ.
     """
     if not (callable(getattr(policy, "init", None)) and callable(getattr(policy, "step", None))):
         raise UserError(f"{type(policy).__name__} is not a policy: it needs init and step")
@@ -52,7 +53,7 @@ def check_compatible(
 
 
 def fitted(policy: PolicyLike, action_shape: tuple[int, ...]) -> Any:
-    """``policy``, whose constant action, if it is flat, gets the environment's shape."""
+    """``policy``; if its action is constant and flat, the action gets the environment's shape."""
     constant = getattr(policy, "action", None)
     if not isinstance(constant, jax.Array) or constant.shape == action_shape:
         return policy

@@ -58,7 +58,7 @@ class ImpairedPolicy(struct.PyTreeNode):
         return strong(ImpairedState(inner, own, jnp.zeros((), jnp.int32), observation, action))
 
     def step(self, state: ImpairedState, observation: jax.Array) -> tuple[jax.Array, ImpairedState]:
-        """The action that arrives at the environment, for the observation that leaves it."""
+        """The action that the environment receives, for the observation that it returned."""
         key = jax.random.fold_in(state.key, state.time)
         seen, observation_state = self.observation.step(
             jax.random.fold_in(key, _OBSERVATION_STREAM), state.observation, observation

@@ -34,8 +34,9 @@ def load_policy(
         history_length: l.
 
     Raises:
-        UserError: when the file is missing, damaged or not a policy; when the lane is missing, lost
-            or not trained yet; when several cells agree with the arguments.
+        UserError: when the file is missing, damaged or not a policy, or is given with arguments
+            that choose a lane; when the lane is missing, lost or not trained yet; when several
+            cells agree with the arguments.
     """
     given: dict[str, Any] = {
         "env": env,

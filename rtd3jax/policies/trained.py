@@ -44,7 +44,8 @@ class PolicyState:
     """The state of a policy in an episode.
 
     Attributes:
-        steps: ring of the last L steps, normalised; None with a running carry.
+        steps: ring of the last `Policy.ring_size` steps, with normalised observations; None with a
+            running carry.
         previous_action: [A], in the units of tokens; zero before the first step.
         time: int32 [], number of steps of the episode so far.
         carry: the memory's running carry, leaves [1, ...]; None without one.
@@ -90,7 +91,7 @@ class Policy:
 
     @property
     def width(self) -> int:
-        """H."""
+        """H, the width of every layer."""
         return int(self.actor["head"]["bias"].shape[-1])
 
     @property

@@ -20,11 +20,13 @@ FILE = "ceilings.json"
 def ceilings_of(
     directory: Path, cells: Sequence[Cell], *, compute: bool
 ) -> dict[tuple[str, str], dict[str, Any]]:
-    """For each (env, disturbance), its ceiling, or why there is none.
+    """The ceilings of the environments of ``cells``, by (env, disturbance).
 
-    A ceiling has a mean, a standard error, a kind, and a measure: ``return``, or ``true_return`` if
-    only the ceiling of the return of the true state is known. Without ``compute``, only stored
-    ceilings of this version are returned.
+    An entry has ``mean``, ``error`` (the standard error), ``kind``, and ``measure``: ``return``, or
+    ``true_return`` if only the ceiling of the return of the true state is known. With ``compute``,
+    missing ceilings are computed and stored; if a ceiling is not known, the only item of the entry
+    is ``missing``, the reason. Without ``compute``, only stored ceilings of this version of the
+    package are returned.
     """
     path = directory / FILE
     version = versions_of(["rtd3jax"])["rtd3jax"]

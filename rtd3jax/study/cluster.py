@@ -39,7 +39,8 @@ from rtd3jax.training.checkpoint import checkpoint_steps
 from rtd3jax.training.lanes import Job, workers
 
 TASKS = "cluster.jsonl"
-"""File with a line per ended task: its cell, node and times, and the steps of its checkpoints."""
+"""File with a JSON line for each task that ended without an error: cell, seeds, node and times, and
+the step from which each lane continued."""
 _POLL_SECONDS = 0.1
 _CONNECT_SECONDS = 10.0
 
@@ -76,7 +77,8 @@ def train_on_cluster(
         imports: modules that register environments.
 
     Raises:
-        UserError: when there is no cluster, no node has the resources, or Ray is not installed.
+        UserError: when Ray is not installed, there is no cluster, no node has the resources, or a
+            node has other versions or cannot read the run directory.
     """
     waiting: dict[Cell, list[Job]] = {}
     for job in waiting_jobs(directory, jobs):
@@ -95,7 +97,7 @@ def train_on_cluster(
                 "num_cpus": need.cpus,
                 "num_gpus": need.gpus,
                 "memory": need.memory,
-                "max_retries": -1,  # if workers or nodes die, not after an error
+                "max_retries": -1,  # Ray repeats a task if its worker dies, not after an error
                 "name": label(members[0]),
             }
             path = str(directory.path.resolve())
@@ -146,7 +148,7 @@ def _check_listening(address: str) -> None:
 
 
 def _need(members: Sequence[Job], work: Work, nodes: Sequence[dict]) -> Need:
-    """The resources for the lanes of a cell, on at most the cores of the largest node.
+    """The resources that the lanes of a cell need, with at most the cores of the largest node.
 
     Raises:
         UserError: for a cell that no node can hold.
@@ -158,7 +160,8 @@ def _need(members: Sequence[Job], work: Work, nodes: Sequence[dict]) -> Need:
     state, working = job_bytes(members[:1]).popitem()[1]
     gpus = 1 if work.strategy == "vmap" else 0
     cpus = min(len(members), int(most["CPU"])) if work.strategy == "map" else 1
-    # Under `map`, all lanes need memory for their states, and those that run for their work.
+    # Under `map`, each lane needs memory for its state, and each lane that advances also needs
+    # memory for temporary arrays.
     size = math.ceil(WORKER_BYTES + len(members) * state + max(cpus, 1) * working)
     need = Need(cpus, gpus, size)
     asked = {"CPU": max(need.cpus, 1), "GPU": need.gpus, "memory": need.memory}
@@ -222,7 +225,10 @@ def _check_nodes(
 
 
 def _probe(mark: str, imports: list[str]) -> tuple[dict[str, str], str | None, str | None]:
-    """On a node: its versions, the content of the file ``mark``, and an error of imports."""
+    """On a node: return its versions, the content of the file ``mark``, and the import error.
+
+    The content is None if the node cannot read the file; the error is None without an error.
+    """
     problem = None
     try:
         import_modules(imports)
@@ -235,18 +241,18 @@ def _probe(mark: str, imports: list[str]) -> tuple[dict[str, str], str | None, s
 def _train_cell(
     path: str, index: int, seeds: list[int], work: Work, cpus: int, imports: list[str]
 ) -> tuple[list[str], dict[str, Any]]:
-    """On a node: train the lanes of a cell; return complaints and a line for `TASKS`."""
+    """On a node: train the lanes of a cell; return the complaints and a row for `TASKS`."""
     began = time.time()
     import_modules(imports)
     directory = RunDirectory.open(path)
     cell = directory.cells[index]
-    # All cells: under `vmap` the longest window of all cells determines the program.
+    # The jobs of all cells, because under `vmap` the longest window of all determines the program.
     jobs = directory.jobs(work.strategy)
     own = [job for job in jobs if job.cell == cell and job.seed in seeds]
     complaints: list[str] = []
     kept = [checkpoint_steps(directory.lanes.checkpoint_directory(cell, seed)) for seed in seeds]
     training = time.time()
-    # This node, not the driver, must have the memory.
+    # The lanes must fit in the memory of this node, not in that of the driver.
     at_once = lanes_at_once(own, work.strategy, cpus or len(workers()), usable_memory())
     here = dataclasses.replace(work, workers=cpus or None, at_once=at_once)
     train_here(directory, own, here, complaints)
@@ -306,7 +312,7 @@ def _bar(quiet: bool) -> Progress:
 
 
 def _last_line(error: BaseException) -> str:
-    """The last line of an error of Ray, whose message is a traceback; else the error's type."""
+    """The last line of an error's message, as Ray's messages are tracebacks; else its type."""
     return (str(error).strip().splitlines() or [type(error).__name__])[-1]
 
 

@@ -18,6 +18,6 @@ def colour_of(algorithm: str, *, on_dark: bool = False) -> str:
 
 
 def ordered(algorithms: Iterable[str]) -> list[str]:
-    """Distinct trained agents in the order of their registration; unknown agents come last."""
+    """The distinct names in the order of registration; unregistered agents come last."""
     known = list(AGENTS)
     return sorted(set(algorithms), key=lambda n: (known.index(n) if n in AGENTS else len(known), n))

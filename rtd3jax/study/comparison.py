@@ -20,12 +20,12 @@ MEASURES = ("return", "true_return")
 def compare_runs(
     directories: Sequence[RunDirectory], names: Sequence[str], measure: str = "return"
 ) -> pd.DataFrame:
-    """A row for each common cell of the first run and another run, and for each run with this cell.
+    """A row for each run with a cell, for each cell that the first run shares with another run.
 
     Args:
         directories: at least two; the first is the baseline.
         names: distinct names of the runs.
-        measure: ``return``, or ``true_return`` of the undisturbed state.
+        measure: ``return``, or ``true_return``, the return of the undisturbed state.
 
     The columns are those of `rtd3jax.study.results.CELL`, ``run``, and the fields of
     `rtd3jax.study.statistics.Summary` and `rtd3jax.study.statistics.Comparison` with the first run.

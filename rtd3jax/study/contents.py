@@ -71,7 +71,11 @@ class Contents:
         return cell_jobs(self.cells, self.seeds, strategy, self.stages)
 
     def lacks(self, asked: "Contents") -> bool:
-        """Whether ``asked`` contains something that this study does not."""
+        """Whether ``asked`` contains something that this study does not contain.
+
+        Raises:
+            UserError: when ``asked`` would change an existing lane.
+        """
         return extended(self, asked) != self
 
 
@@ -158,7 +162,11 @@ def _key(cell: Cell) -> tuple[Any, ...]:
 
 
 def _with_more_steps(there: Cell, asked: Cell) -> Cell:
-    """``asked``, if it equals ``there`` with the same steps or more; else UserError."""
+    """``asked`` if it only has more steps than ``there``, and ``there`` if both are equal.
+
+    Raises:
+        UserError: when the cells differ otherwise.
+    """
     before, after = there.to_dict(), asked.to_dict()
     longer = after["total_steps"] > before["total_steps"]
     for name in before:
@@ -168,7 +176,7 @@ def _with_more_steps(there: Cell, asked: Cell) -> Cell:
 
 
 def _unusual(there: Contents, added: Sequence[Cell]) -> str:
-    """Fields in which added cells differ from all earlier cells, perhaps by a forgotten flag."""
+    """Fields in which added cells differ from all earlier cells: a flag may have been forgotten."""
     old = [cell.to_dict() for cell in there.cells]
     words: dict[str, None] = {}
     for cell in added:

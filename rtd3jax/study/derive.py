@@ -33,7 +33,16 @@ class Reference:
 def derive(
     directory: RunDirectory, references: Iterable[Reference], *, pictures: bool = True
 ) -> None:
-    """Write tables, figures and the summary of the lanes that have ended."""
+    """Write tables, figures and the summary of the lanes that have ended.
+
+    Args:
+        directory: the run directory.
+        references: policies that need no training.
+        pictures: whether to draw the figures.
+
+    Raises:
+        UserError: when the file of a lane is damaged.
+    """
     # If shards end together, the last one that holds the lock reads the lanes of all.
     with deriver(directory.path):
         _derive(directory, references, pictures)

@@ -47,7 +47,7 @@ _STYLE: Any = {
 
 
 Ceilings = Mapping[tuple[str, str], Mapping[str, Any]]
-"""``mean`` and ``kind`` by (env, disturbance); see `rtd3jax.study.ceilings`."""
+"""``mean``, ``kind`` and ``measure`` by (env, disturbance); see `rtd3jax.study.ceilings`."""
 
 
 def learning_curves(
@@ -58,10 +58,11 @@ def learning_curves(
 ) -> list[Path]:
     """Draw return against environment steps; return the paths of the PNG and the SVG.
 
-    ``curves`` has the columns of CURVES, and ``references`` those of EPISODES, from which only the
-    rows of reference policies are used. Known ``ceilings`` are drawn too. There is a panel for each
-    disturbance (row) and history length (column). A line is the interquartile mean (IQM) over the
-    seeds with a finite value at this step, and its band is the 95% bootstrap interval.
+    ``curves`` has the columns of `rtd3jax.study.results.CURVES`, and ``references`` those of
+    `rtd3jax.study.results.EPISODES`, of which only the rows of reference policies are used. Known
+    ``ceilings`` are drawn too. There is a panel for each disturbance (row) and history length
+    (column). A line is the interquartile mean (IQM) over the seeds with a finite value at this
+    step, and its band is the 95% bootstrap interval.
 
     The panels of a row share their y-limits: from the lower quartile of all lower band edges
     (or the lowest final IQM, if lower, so that no line ends outside) to the highest upper edge. So
@@ -94,11 +95,11 @@ def final_returns(
 ) -> list[Path]:
     """Draw the final evaluation; return the paths of the PNG and the SVG.
 
-    ``episodes`` has the columns of EPISODES. There is a panel for each disturbance, with the
-    algorithms along x. Light dots are the mean returns of single seeds, the marker is their
-    interquartile mean, and the bar is its 95 % bootstrap interval (none for a single seed). The
-    shape of the marker shows the history length; horizontal lines are the reference policies and
-    known ``ceilings``.
+    ``episodes`` has the columns of `rtd3jax.study.results.EPISODES`. There is a panel for each
+    disturbance, with the algorithms along x. Light dots are the mean returns of single seeds, the
+    marker is their interquartile mean, and the bar is its 95 % bootstrap interval (none for a
+    single seed). The shape of the marker shows the history length; horizontal lines are the
+    reference policies and known ``ceilings``.
     """
     with mpl.rc_context(_STYLE):
         lanes = seed_means(episodes)
@@ -279,7 +280,7 @@ def _fit(axes: Axes, values: Iterable[float], references: dict[str, float]) -> N
 def _reference_means(
     episodes: pd.DataFrame | None, ceilings: Ceilings | None, task: tuple[str, str]
 ) -> dict[str, float]:
-    """Mean return of each reference policy that has one, and the return's ceiling."""
+    """The finite mean returns of the reference policies, and the ceiling of the return."""
     means = {}
     if episodes is not None:
         rows = _of_task(episodes, task)

@@ -1,7 +1,7 @@
 """File locks of the operating system: flock, or byte ranges on Windows.
 
 A lock is released when its process ends for any reason. On a file system without locks (Lustre
-without flock, NFS without a lock daemon), nothing is locked, and a single warning says so.
+without flock, NFS without a lock daemon), nothing is locked, and a warning says so.
 """
 
 import errno
@@ -51,7 +51,13 @@ def lock(handle: int, *, shared: bool = False, wait: bool = False) -> None:
 
 
 def open_for_locking(path: Path, *, create: bool = True) -> int:
-    """Open the file, which must not be a link; `os.close` releases its locks."""
+    """Open the file for `lock`; `os.close` releases its locks. It must not be a symbolic link.
+
+    Without ``create``, the file must exist; it is opened for reading if it cannot be written.
+
+    Raises:
+        OSError: when the file cannot be opened.
+    """
     flags = os.O_RDWR | getattr(os, "O_NOFOLLOW", 0)
     if create:
         return os.open(path, flags | os.O_CREAT, 0o666)

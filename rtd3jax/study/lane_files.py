@@ -36,7 +36,7 @@ class LaneFiles:
         return self._within("lanes", cell_name(cell), f"seed-{seed}.safetensors")
 
     def digest(self, cell: Cell, seed: int) -> str:
-        """A digest of a lane's file: another one if the lane was trained further, or again."""
+        """The SHA-256 digest of a lane's file; more training, or a new one, changes it."""
         return hashlib.sha256(self.lane_path(cell, seed).read_bytes()).hexdigest()
 
     def checkpoint_directory(self, cell: Cell, seed: int) -> Path:
@@ -64,7 +64,10 @@ class LaneFiles:
         return path.read_text("utf-8", "replace").strip() if path.exists() else None
 
     def is_done(self, cell: Cell, seed: int) -> bool:
-        """Whether the lane was trained to its current number of steps, or was lost."""
+        """Whether the lane was trained to its current number of steps, or was lost.
+
+        A lane whose file is damaged counts as done.
+        """
         path = self.lane_path(cell, seed)
         if not path.exists():
             return False
@@ -99,7 +102,7 @@ class LaneFiles:
             curves: ``steps``, ``returns``, ``true_returns`` [K] and ``final_returns``,
                 ``final_true_returns`` [episodes].
             metrics: metrics of learning, [K] by name.
-            failure: step and reason, if the lane was lost.
+            failure: ``step`` and ``reason`` if the lane was lost, else None.
             interface: the result of `Policy.interface`, with which the policy can be loaded even if
                 the cell's environment is not registered.
         """
@@ -177,7 +180,7 @@ def cell_name(cell: Cell) -> str:
 
 
 def file_name(env: str, disturbance: str, *rest: str) -> str:
-    """A file name of an environment, its disturbance, and what else there is."""
-    # "~" separates alternatives; "-" stands for any other character.
+    """A file name made of an environment, its disturbance and other parts."""
+    # "~" replaces "/", which separates alternatives; "-" replaces any other special character.
     text = "_".join((env, disturbance.replace("/", "~"), *rest))
     return re.sub(r"[^A-Za-z0-9._=+~-]", "-", text)

@@ -17,7 +17,7 @@ from rtd3jax.study.filelock import lock, open_for_locking
 
 
 def parse_shard(text: str) -> tuple[int, int]:
-    """Parse ``"2/4"`` as (2, 4), the second of four shares."""
+    """Parse ``"2/4"`` as (2, 4), the second of four shards; UserError for any other form."""
     match = re.fullmatch(r"\s*(\d{1,6})\s*/\s*(\d{1,6})\s*", text)
     if match is None or not 1 <= int(match[1]) <= int(match[2]):
         raise UserError(f"--shard {text!r} is not of the form i/n with 1 <= i <= n")
@@ -80,7 +80,7 @@ def _is_locked(path: Path) -> bool:
         return False
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of a file system without locks
+            warnings.simplefilter("ignore")  # the warning of a file system without locks
             lock(handle)
     except BlockingIOError:
         return True

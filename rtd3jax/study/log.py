@@ -18,7 +18,10 @@ def append_rows(path: Path, rows: Iterable[dict[str, Any]]) -> None:
 
 
 def repair_log(path: Path) -> dict[tuple[Any, ...], Any]:
-    """Complete a truncated last line; return the last return of each lane and step in the log."""
+    """End an incomplete last line; return the last logged return by lane and step.
+
+    A key is the lane as in `lane_of`, followed by the step.
+    """
     if path.exists() and not path.read_bytes().endswith(b"\n"):
         with path.open("a", encoding="utf-8") as file:
             file.write("\n")

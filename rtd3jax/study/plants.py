@@ -22,7 +22,7 @@ Plants = dict[str, dict[str, Any]]
 """The identity of each pair of an environment and a disturbance, by `plant_name`."""
 
 CODE = "code"
-"""Part of an identity: what its environment computes."""
+"""The part of an identity that identifies what the code of the environment computes."""
 
 
 def plants_of(cells: Iterable[Cell]) -> Plants:
@@ -91,8 +91,8 @@ def _is_other_code(before: dict[str, str] | None, now: dict[str, str] | None) ->
 def _code_of(env: EnvironmentLike, params: object) -> dict[str, str] | None:
     """A digest of the operations of reset and step, without the numbers of the parameters.
 
-    Nothing is compiled. None for an environment that calls Python while it runs, of which the
-    digest would not contain all and would differ in every process.
+    Nothing is compiled. The result is None for an environment that calls Python while it runs: the
+    digest would not cover this Python code, and would differ in every process.
     """
     if is_simulated(env):
         return None

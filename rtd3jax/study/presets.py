@@ -1,7 +1,7 @@
 """Presets of the sweep: a quick study, and the paper's studies with tuned settings.
 
 The paper states no hyper-parameters. experiments/rover_search.py and experiments/pendulum_search.py
-found these settings, with seeds that are not reported; docs/what_the_paper_leaves_open.md explains
+found these settings, with seeds that no result uses; docs/what_the_paper_leaves_open.md explains
 why they help.
 """
 
@@ -79,7 +79,7 @@ _IN_MINUTES: dict[str, Any] = {
     "actor_learning_rate": 5e-3,
     "eval_every": 1_000,
 }
-"""Settings for a rover study of minutes: half the width and steps, larger learning rates."""
+"""Settings for a rover study of minutes: smaller and shorter trainings, larger learning rates."""
 
 _ROVER = Grid(
     "rover",

@@ -89,7 +89,7 @@ class Recorder:
                 )
                 there = self._there.get(tuple(lane.values()), math.nan)
                 if there == value:
-                    continue  # from before a restart; a lane that is trained anew may differ
+                    continue  # logged before a restart; a lane that is trained anew may differ
                 row = {
                     **lane,
                     "return": value,

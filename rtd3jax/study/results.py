@@ -25,7 +25,7 @@ from rtd3jax.system.parquet import read_parquet
 REFERENCE_SEED = -1
 
 LANE = "lane"
-"""The column of a later test with the digest of the lane's file, whose policy was tested."""
+"""The column of later tests (transfer, robustness) with the digest of the tested lane's file."""
 
 # What identifies one experimental cell; a cell plus a seed is one training lane.
 CELL = ("env", "disturbance", "algorithm", "history_length")
@@ -79,9 +79,11 @@ def write_table(
 ) -> None:
     """Write ``rows`` (dicts or a Table, one entry per column of ``schema``) to a Parquet file.
 
-    Rows are sorted by ``key_columns(schema)``. Two rows with equal keys raise ``UserError``: their
-    order would not be reproducible.
-    A missing measurement is NaN, never None.
+    Rows are sorted by ``key_columns(schema)``. A missing measurement is NaN, never None.
+
+    Raises:
+        UserError: when rows do not fit the schema, an entry is None, or two rows have equal keys:
+            their order would not be reproducible.
     """
     table = _as_table(rows, schema)
     for name in schema.names:
@@ -108,8 +110,10 @@ def frame(rows: Iterable[Mapping], schema: pa.Schema) -> pd.DataFrame:
 def read_table(path: str | os.PathLike, schema: pa.Schema | None = None) -> pd.DataFrame:
     """Read a file of ``write_table`` as a DataFrame [rows, columns].
 
-    Without ``schema`` the file may be any of this module's tables. Raises ``UserError`` when the
-    file is missing, cannot be read as Parquet, or has other columns than expected.
+    Without ``schema`` the file may be any of this module's tables.
+
+    Raises:
+        UserError: when the file is missing, cannot be read as Parquet, or has other columns.
     """
     path = user_path(path)
     if not path.is_file():

@@ -31,7 +31,7 @@ def run_robustness(
     episodes: int,
     say: Callable[[str], None] = print,
 ) -> pd.DataFrame:
-    """Test every trained policy of ``directory``; write ``robustness.parquet`` and pictures.
+    """Test every trained policy of ``directory``, and write ``robustness.parquet``.
 
     Args:
         directory: the run directory.
@@ -41,6 +41,9 @@ def run_robustness(
             of its episodes, so agents with the same seed meet the same episodes.
         say: receives a line if a stress does not fit an environment, a lane has no policy, or the
             code of a plant has changed since the study began.
+
+    Returns:
+        The table, with the columns `COLUMNS` and `LANE`.
 
     Raises:
         UserError: for an unknown stress or an impossible value, when nothing is trained yet, when
@@ -116,7 +119,11 @@ def over_seeds(rows: pd.DataFrame) -> pd.DataFrame:
 def _all_cases(
     cells: Sequence[Cell], stresses: Sequence[str] | None, say: Callable[[str], None]
 ) -> dict[tuple[str, str], list[Case]]:
-    """The cases of each environment and disturbance, without those that no stress fits."""
+    """The cases of each environment and disturbance.
+
+    If one of the stresses does not fit an environment, this environment has no cases, and ``say``
+    receives a line. UserError if no environment has cases.
+    """
     cases: dict[tuple[str, str], list[Case]] = {}
     problems: list[UserError] = []
     for key, cell in {(cell.env, cell.disturbance): cell for cell in cells}.items():

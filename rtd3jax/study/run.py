@@ -28,7 +28,7 @@ def run_study(
     """Train the lanes of a run directory that have not ended, and write its results.
 
     Args:
-        directory: the run directory, which is prepared.
+        directory: the run directory, after `RunDirectory.prepare`.
         jobs: a job for each lane of the study, also for those that have ended.
         work: options of the training.
         log: names of trackers.
@@ -37,7 +37,8 @@ def run_study(
         trainer: makes the function that trains, from the handles of the locks that are held.
 
     Returns:
-        A line for each lane that was lost or failed, and the interrupt that ended the training.
+        A line for each lane that was lost or failed; and the interrupt that ended the training, or
+        None.
     """
     complaints: list[str] = []
     interrupt: KeyboardInterrupt | None = None

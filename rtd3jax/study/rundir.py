@@ -74,7 +74,11 @@ class RunDirectory:
 
     @classmethod
     def open(cls, path: str | Path) -> "RunDirectory":
-        """Open the existing study in ``path``."""
+        """Open the existing study in ``path``.
+
+        Raises:
+            UserError: when there is no study, or an agent or memory of it is not registered.
+        """
         there = Contents.read(user_path(path) / CONFIG)
         directory = cls(path, there.cells, there.seeds, there.episodes)
         directory.contents = there
@@ -105,6 +109,9 @@ class RunDirectory:
         Returns:
             A message about plants whose code has changed, about additions, or about cells and
             seeds that this sweep does not name; it is usually empty.
+
+        Raises:
+            UserError: when an existing lane or plant would change.
         """
         config = self.path / CONFIG
         if not config.exists():
@@ -140,6 +147,10 @@ class RunDirectory:
 
         The configuration is written atomically, and only while no other process writes to the
         directory.
+
+        Raises:
+            UserError: as `plan` does, or when the directory holds other files, cannot be written,
+                or another process writes to it.
         """
         try:
             self.path.mkdir(parents=True, exist_ok=True)

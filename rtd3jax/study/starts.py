@@ -28,14 +28,14 @@ def add_starts(
 ) -> None:
     """Give each unfinished job the networks from which its lane starts, and check them.
 
-    A lane that has checkpoints continues from them. It only needs its start if none of them can be
-    read, so a start that cannot be read is no error then.
+    A lane that has checkpoints continues from them, and only needs its start if none of its
+    checkpoints can be read. So for such a lane, a start that cannot be read is no error.
 
     Args:
         directory: the run directory of the study.
         jobs: the jobs of its lanes.
-        write: whether to write a file beside each lane that names its start.
-        fresh: whether all lanes start, whatever the directory holds now.
+        write: whether to write, beside the file of each lane, a file that names its start.
+        fresh: whether all lanes start at their first step, whatever the directory holds now.
 
     Raises:
         UserError: as `starts_of` does, or when a start is of another agent or has other sizes.

@@ -13,10 +13,11 @@ from rtd3jax.training.checkpoint import checkpoint_steps
 
 
 def ledger(directory: RunDirectory) -> list[dict[str, Any]]:
-    """Each lane's state: done, lost, failed, running, interrupted (at a step), or planned.
+    """A row for each lane: the key of its cell, ``seed``, ``status``, ``step`` and ``reason``.
 
-    The state is not stored: it is derived from the files of the lanes, the log and the lock, so it
-    always agrees with them.
+    The status is done, lost, failed, running, interrupted (at a step), or planned. It is not
+    stored: it is derived from the files of the lanes, the log and the lock, so it always agrees
+    with them.
     """
     begun = "running" if is_held(directory.path) else "interrupted"
     logged = steps_reached(read_log(directory.path / LOG))

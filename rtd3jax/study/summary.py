@@ -166,7 +166,7 @@ def _interval(summary: Summary) -> str:
 
 
 def number(value: float) -> str:
-    """A number with four significant digits, without an exponent below a million."""
+    """A number as text: one decimal from 100 to a million, else four significant digits."""
     if 100 <= abs(value) < 1e6:
         return f"{value:.1f}"
     return f"{value:.4g}"

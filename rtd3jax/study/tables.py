@@ -90,8 +90,8 @@ def current_tables(
 ) -> dict[str, pd.DataFrame]:
     """The tables `SCHEMAS` of all lanes that have ended; without any lane they are empty.
 
-    They are those of the Parquet files, with the lanes that ended after these were written: a
-    sweep that is killed does not write its tables any more. Nothing is written.
+    The rows are those of the Parquet files, and those of the lanes that ended after the files were
+    written, because a sweep that is killed does not write its tables. Nothing is written.
 
     Args:
         directory: the run directory.
@@ -125,7 +125,7 @@ def current_tables(
 def _later_lanes(
     directory: RunDirectory, tables: dict[str, pd.DataFrame]
 ) -> list[tuple[Cell, int]]:
-    """The lanes with files that are not in the tables, or that are newer than these.
+    """The lanes whose files are not in the tables, or are newer than the tables.
 
     A file is newer if the lane was trained further, or again.
     """

@@ -18,7 +18,9 @@ from rtd3jax.system.files import check_writable, write_bytes_atomically
 FILE = "transfer.parquet"
 CELL = ["env", "algorithm", "history_length", "trained_on", "tested_on"]
 COLUMNS = (*CELL, "seed", "episode", "return")
-"""One row per lane, tested disturbance and episode."""
+"""Columns of the table besides ``true_return`` and `LANE`.
+
+There is one row per lane, tested disturbance and episode."""
 
 
 def transfer(
@@ -30,11 +32,11 @@ def transfer(
     cells: Sequence[Cell] | None = None,
     write: bool = True,
 ) -> pd.DataFrame:
-    """Test every trained policy of ``directory``, and write returns to ``transfer.parquet``.
+    """Test every trained policy of ``directory``, and write the returns to ``transfer.parquet``.
 
     Args:
         directory: the run directory.
-        tested_on: disturbances; by default those of the run for the same environment.
+        tested_on: disturbances; by default those that the run has for the same environment.
         episodes: number of episodes for each policy and disturbance. The seed of a lane is also the
             seed of its episodes, so agents with the same seed meet the same episodes.
         cells: cells whose policies are tested; all cells by default.
@@ -42,9 +44,12 @@ def transfer(
         say: receives a line if a disturbance does not fit some policies, or the code of a plant has
             changed since the study began.
 
+    Returns:
+        The table, with the columns `COLUMNS`, ``true_return`` and `LANE`.
+
     Raises:
-        UserError: for an unknown disturbance, when nothing is trained yet, when no plant is the one
-            of the study, or when the table could not be written.
+        UserError: when no plant could be made with any of the disturbances, or each has changed
+            since the study began; when nothing is trained yet; when the table could not be written.
     """
     if write:
         check_writable(directory.path)

@@ -101,7 +101,7 @@ class _Orders:
 
     def __init__(self, source: IO[str]) -> None:
         self.stopped = threading.Event()
-        """Set at the end of the input, and at SIGTERM, which a batch system sends to everyone."""
+        """Set at the end of the input, and at SIGTERM, which batch systems send to each process."""
         self._waiting: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
         signal.signal(signal.SIGTERM, self._stop)
         threading.Thread(target=self._read, args=(source,), daemon=True).start()

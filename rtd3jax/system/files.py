@@ -67,7 +67,7 @@ def check_target(path: str | os.PathLike, overwrite: bool = False) -> Path:
 
 
 def check_writable(directory: Path) -> None:
-    """Raise UserError if no file can be written to the directory, before hours of work for it."""
+    """Raise UserError if no file can be written to the directory; for use before long work."""
     if not os.access(directory, os.W_OK | os.X_OK):
         raise UserError(f"{directory} cannot be written: it is read-only for this user")
 
@@ -151,7 +151,7 @@ def flatten(tree: object, prefix: str = "") -> dict[str, np.ndarray]:
 
 
 def unflatten(flat: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """The nested dict that `flatten` took apart."""
+    """The nested dict of arrays under dotted names: the inverse of `flatten`."""
     tree: dict[str, Any] = {}
     for name, value in flat.items():
         *parents, last = name.split(".")

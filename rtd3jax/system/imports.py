@@ -1,4 +1,4 @@
-"""Imports a user's modules by name, as ``--import`` asks."""
+"""Imports a user's modules by name, for the option ``--import``."""
 
 import importlib
 import os
@@ -12,7 +12,7 @@ def import_modules(modules: Sequence[str]) -> None:
     """Import modules that register environments, agents or memories.
 
     Args:
-        modules: their names; a module of the working directory is found too.
+        modules: their names; modules in the working directory are found too.
 
     Raises:
         UserError: when a module cannot be imported.

@@ -12,11 +12,11 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 @contextlib.contextmanager
 def patient(message: str) -> Iterator[None]:
-    """While it is open, the first interrupt only prints ``message``; the next one is handled.
+    """A context in which the first interrupt only prints ``message``; the next one is handled.
 
-    A person who sees nothing happen after Ctrl-C presses it again, and must not lose what is being
-    written. Only the main thread handles signals: in others, this has no effect. Signals that the
-    process ignores stay ignored.
+    A user who sees no effect of Ctrl-C presses it again. The message explains the wait, so that the
+    user does not lose the files that are being written. Only the main thread handles signals: in
+    other threads, the context has no effect. Signals that the process ignores stay ignored.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

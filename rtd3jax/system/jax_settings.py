@@ -15,10 +15,10 @@ _CONTEXTS: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "jax_threefry_partitionable": (True, jax.threefry_partitionable),
     "jax_enable_x64": (False, jax.enable_x64),
 }
-"""The value by default, and the context manager, of each setting."""
+"""The default value and the context manager of each setting."""
 
 Settings = tuple[tuple[str, Any], ...]
-"""Names and values of the settings that are not those by default."""
+"""Names and values of the settings that differ from their defaults."""
 
 
 def jax_settings() -> Settings:
@@ -29,7 +29,7 @@ def jax_settings() -> Settings:
 
 @contextlib.contextmanager
 def with_settings(settings: Settings) -> Iterator[None]:
-    """Enter the settings that another thread has."""
+    """A context with the settings of another thread, from its `jax_settings`."""
     given = dict(settings)
     with contextlib.ExitStack() as stack:
         for name, (default, context) in _CONTEXTS.items():
@@ -38,8 +38,8 @@ def with_settings(settings: Settings) -> Iterator[None]:
 
 
 def random_key(seed: int | jax.Array) -> jax.Array:
-    """The key of a seed, with JAX's default generator whatever is set.
+    """The key of a seed, for JAX's default generator, even if another one is set.
 
-    Side by side (vmap), the numbers of ``rbg`` and ``unsafe_rbg`` depend on the other lanes.
+    Under vmap, the numbers of the generators ``rbg`` and ``unsafe_rbg`` depend on the other lanes.
     """
     return jax.random.key(seed, impl="threefry2x32")

@@ -1,10 +1,10 @@
 """Pytrees of different types that JAX cannot confuse.
 
-`jax.jit` keeps its traces by the structure of the arguments. JAX 0.10 to 0.11 compares structures
-of registered dataclasses, and so of ``flax.struct``'s, by their fields without their types: the
-structures of ``A(1.0)`` and ``B(1.0)`` are equal, only their hashes differ. In one to two of a
-hundred pairs of types, both hashes meet in the tables of traces, and ``B`` silently runs the
-program of ``A``. This concerns arguments that may have one of several types: processes and
+`jax.jit` stores its traces by the structure of the arguments. JAX 0.10 to 0.11 compares structures
+of registered dataclasses, such as those of ``flax.struct``, by their fields without their types:
+the structures of ``A(1.0)`` and ``B(1.0)`` are equal, and only their hashes differ. For one to two
+of a hundred pairs of types, both hashes lead to the same entry of the table, and ``B`` silently
+runs the program of ``A``. This concerns arguments that may have one of several types: processes and
 policies.
 """
 
@@ -50,7 +50,7 @@ class TypedNode:
 
 
 def node_types(tree: object) -> tuple[type, ...]:
-    """The types of all nodes of ``tree``, as a static argument beside it."""
+    """The types of all nodes of ``tree``, for a static argument besides ``tree`` itself."""
     found: list[type] = []
     pending: list[Any] = [jax.tree.structure(tree)]
     while pending:

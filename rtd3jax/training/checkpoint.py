@@ -109,7 +109,7 @@ class Checkpoints:
         except OSError as error:
             remark = "; the previous checkpoint is kept" if before else ""
             raise _unwritable(directory, error, remark) from error
-        # Files of later steps are from before a lane started over: those would never be continued.
+        # Files of later steps were written before a lane started over: no lane continues from them.
         earlier = [old for old in before if (_step(old) or 0) < step]
         stale = [old for old in before if old not in earlier[: kept - 1]]
         for old in [*stale, *_unfinished(directory)]:
@@ -207,7 +207,7 @@ class Checkpoints:
             "versions": versions(),
             "settings": dict(jax_settings()),
         }
-        # Checkpoints of earlier versions do not name the settings of JAX: they had the usual ones.
+        # Checkpoints of earlier versions do not name JAX's settings, which were the defaults.
         there = {"settings": {}, **(metadata if isinstance(metadata, dict) else {})}
         if PLANT not in (there.get("identity") or {}):
             here["identity"] = {n: x for n, x in here["identity"].items() if n != PLANT}

@@ -94,7 +94,7 @@ def _compile(program: Program, lane: Lane, batched: bool, device: jax.Device) ->
 
 @contextlib.contextmanager
 def _no_collection() -> Iterator[None]:
-    """Switch off garbage collection during a trace, of which it would take a tenth of the time."""
+    """A context without garbage collection, which would take a tenth of the time of a trace."""
     enabled = gc.isenabled()
     gc.disable()
     try:

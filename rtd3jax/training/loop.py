@@ -116,7 +116,7 @@ class Program:
         config: the configuration with traced fields at their defaults; see `make_program`.
         observation_size: O.
         action_shape: shape of the environment's action.
-        true_observation_size: S; 0 if the environment does not tell the undisturbed observation.
+        true_observation_size: S; 0 if the environment does not give the undisturbed observation.
     """
 
     env: EnvironmentLike
@@ -132,7 +132,7 @@ class Program:
 
     @property
     def action_size(self) -> int:
-        """A."""
+        """A, the number of elements of an action."""
         return math.prod(self.action_shape)
 
     @property
@@ -147,7 +147,7 @@ class Program:
 
     @property
     def evaluations(self) -> int:
-        """K."""
+        """K, the number of evaluations."""
         return -(-self.config.total_steps // self.config.eval_every)
 
     def init(self, lane: Lane) -> LaneState:
@@ -297,9 +297,10 @@ class Program:
         return normalised(present, normaliser)
 
     def cut(self, lane: Lane, state: LaneState, step: jax.Array) -> LaneState:
-        """The state whose episodes end before ``step``: the replay has the carries at their end.
+        """The state after its episodes are cut off before ``step`` of all environments.
 
-        Without an end, `store` leaves this to the next step, which here begins other episodes.
+        The replay then holds the carries at the cut. During an episode, `store` leaves this to the
+        next step, but after a cut, the next step begins another episode.
         """
         window = self._window(lane, state, step, _normaliser(state.statistics))
         _, kept = self.agent.act(state.learner.actor, window, state.carry)
@@ -322,9 +323,8 @@ class Program:
 
         Returns:
             The next observations [E, O], the state, rewards, terminations and truncations [E], and
-            those entries of info that are needed: the observations [E, O] before automatic resets,
-            which are final ones at the end of an episode, and these without disturbances, [E, S],
-            if the critics read them.
+            the required entries of info: ``final_observation`` [E, O], the observations before
+            automatic resets, and ``true_observation`` [E, S], if the critics read it.
         """
         wanted = ("final_observation", *["true_observation"] * self.agent.reads_truth)
         bounds = self.bounds(lane)
@@ -353,7 +353,7 @@ class Program:
     def _explore(
         self, greedy: jax.Array, key: jax.Array, hyperparameters: Hyperparameters, step: jax.Array
     ) -> jax.Array:
-        """The actions [E, A]: uniform before learning starts, then those of the agent with noise.
+        """The actions [E, A]: uniform before learning starts, then the agent's with noise.
 
         A lane that starts from trained networks uses its policy from the first step on.
         """

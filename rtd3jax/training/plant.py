@@ -12,20 +12,20 @@ from rtd3jax.envs.identity import in_words
 from rtd3jax.protocols import EnvironmentLike
 
 MOST_NUMBERS = 1_000
-"""Numbers of an array that the identity of a checkpoint contains; of a longer one, a digest."""
+"""Most numbers of an array that an identity contains; a longer array is replaced by its digest."""
 
 PLANT = "plant"
-"""Part of an identity that earlier checkpoints do not have."""
+"""Key of the part of an identity that earlier checkpoints do not have."""
 
 
 def plant_of(env: EnvironmentLike, params: object) -> dict[str, Any]:
     """The identity of an environment with these parameters, equal in every process.
 
-    Two plants with the same name differ in it if their parameters, their recordings or their static
-    options differ. What the code of the environment computes is not part of it.
+    The identities of two plants with the same name differ if their parameters, their recordings or
+    their static options differ. They do not contain what the code of the environment computes.
     """
     name = str(getattr(env, "name", type(env).__name__))
-    # Static options are not among the parameters, such as the channel of a disturbance.
+    # Static options, such as the channel of a disturbance, are not leaves of the parameters.
     options = in_words(env)
     if is_simulated(env):  # the observed elements, and the arguments of its construction
         name, options = simulated_identity(env), getattr(env, "reward_from", "")

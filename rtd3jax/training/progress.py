@@ -64,8 +64,8 @@ class Progress:
             curve = curve[np.isfinite(curve)]
             if curve.size:
                 self._latest[self._label(job), id(job)] = float(curve[-1])
-        # Workers read checkpoints when they begin. Their steps take no time, so they are set and
-        # not added, which would count for the speed.
+        # Workers read checkpoints when they begin. The steps of a checkpoint took no time here, so
+        # they are set directly: an addition by the bar would count for the speed.
         start = sum(group.began_at * len(group.jobs) for group in self._groups)
         self._bar.tasks[self._task].completed += start - self._start
         self._start = start

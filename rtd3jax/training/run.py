@@ -90,7 +90,11 @@ class Run:
     _policies: tuple[Policy | None, ...] = dataclasses.field(repr=False)
 
     def policy(self, seed: int) -> Policy:
-        """The trained policy of ``seed``."""
+        """The trained policy of ``seed``.
+
+        Raises:
+            UserError: when ``seed`` was not trained, or its lane was lost.
+        """
         if seed not in self.seeds:
             raise UserError(f"seed {seed} was not trained; the seeds are {list(self.seeds)}")
         policy = self._policies[self.seeds.index(seed)]
@@ -242,7 +246,7 @@ def _checkpoints(
     env: EnvironmentLike,
     seconds: float | None,
 ) -> Checkpoints:
-    # A recording is digested once, and not at every checkpoint.
+    # A recording is digested once for each lane, not at every checkpoint.
     plant = functools.cache(lambda job: plant_of(env, job.lane.env_params))
 
     def identity(job: Job) -> dict[str, Any]:
@@ -279,6 +283,9 @@ def make_jobs(
     """Check the environment, and make a job per seed with key ``(cell, seed)``.
 
     With ``window``, jobs of shorter history lengths share the program of length ``window``.
+
+    Raises:
+        UserError: for an unsuitable environment or configuration.
     """
     check_compiling()
     params = parameters_of(env, params)
@@ -368,7 +375,7 @@ def failure_of(seed: int, state: LaneState) -> Failure | None:
 
 
 def check_seeds(seeds: Iterable[int]) -> tuple[int, ...]:
-    """Distinct integers in 0..2**32-1, at least one."""
+    """The seeds as integers; UserError for no seeds, equal seeds, or seeds outside [0, 2**32)."""
     listed = as_list(seeds)
     if listed is None:
         raise UserError(f"seeds must be a sequence of integers such as range(5), not {seeds!r}")

@@ -1,8 +1,8 @@
-"""Training that goes on from what was trained before: a policy, or a lane's whole learner.
+"""Starts of training from trained networks: from a policy, or from the whole learner of a lane.
 
-A policy gives its actor, and the statistics by which it reads observations. A checkpoint gives the
-critics, the targets and the optimisers as well. Replay, the plant's state and random numbers are
-the new lane's own.
+A policy contains its actor, and the statistics that normalise its observations. A checkpoint also
+contains the critics, the targets and the optimisers. The replay, the state of the environment and
+the random numbers always belong to the new lane.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ from rtd3jax.training.checkpoint import checkpoint_files, leaves_from_arrays
 from rtd3jax.training.loop import HEALTHY, Lane, LaneState, Program
 
 KNOWN_OBSERVATIONS = 1_000
-"""The number of observations as which a policy's statistics count in those of the new lane."""
+"""Number of observations for which a policy's statistics count in the statistics of a new lane."""
 
 _TAKEN = "learner", "statistics", "true_statistics"
 """The parts of a `LaneState` in a lane's checkpoint from which training continues."""
@@ -37,11 +37,11 @@ class Start:
     """The networks from which one lane starts.
 
     Attributes:
-        where: a name of the source, for people.
-        policy: the trained policy, if the source has no more than that.
-        checkpoint: the checkpoint of a lane, which has more than the policy; None without it.
-        missing: the reason why neither can be read. A lane that is under way does not need its
-            start, unless its own checkpoints are lost.
+        where: the name of the source, for messages and tables.
+        policy: the trained policy, if the source is a policy.
+        checkpoint: the checkpoint of a lane, if the source is a lane.
+        missing: the reason why the source cannot be read. This is an error only for a lane without
+            checkpoints of its own, because other lanes do not need their start any more.
     """
 
     where: str
@@ -51,22 +51,22 @@ class Start:
 
     @property
     def about(self) -> str:
-        """What the lane takes over, and from where, for tables."""
+        """The networks that the lane takes over, and their source, for tables."""
         whole = "actor, critics and optimisers" if self.checkpoint is not None else "actor"
         return f"{whole} of {self.where}"
 
     def begin(self, program: Program, lane: Lane, state: LaneState) -> LaneState:
-        """The lane's ``state`` before its first step, with what was trained before.
+        """The lane's ``state`` before its first step, with the networks of this start.
 
         Raises:
-            UserError: when it is of another agent, of other sizes, or cannot be read.
+            UserError: when the networks are of another agent or other sizes, or cannot be read.
         """
         begun = self._begin(program, lane, state)
-        self.__dict__.pop("_read", None)  # it was taken over
+        self.__dict__.pop("_read", None)  # the arrays are now in the lane's state
         return begun
 
     def check(self, program: Program, lane: Lane) -> None:
-        """Raise as `begin` would, before anything is compiled; `begin` then reads nothing again."""
+        """Raise the errors of `begin` before anything is compiled; `begin` uses the read arrays."""
         self._begin(program, lane, jax.eval_shape(program.init, lane))
 
     def _begin(self, program: Program, lane: Lane, state: LaneState) -> LaneState:
@@ -83,7 +83,7 @@ class Start:
         if policy.normaliser is not None:
             statistics = _statistics_of(policy.normaliser)
         learner = state.learner
-        # Copies: a lane's buffers are donated, and the policy stays its owner's.
+        # Copies: a lane's buffers are donated, but the owner of the policy keeps using it.
         names = [name for name in ("actor", "target_actor") if hasattr(learner, name)]
         parts = {name: jax.tree.map(jnp.array, policy.actor) for name in names}
         learner = dataclasses.replace(learner, **parts)
@@ -115,7 +115,8 @@ class Start:
         if program.agent.acting_actor.memory is not None:
             fields.append("memory")
         for name in fields:
-            before = there.get(name, getattr(Config, name, None))  # it may be older than the field
+            # A file of an earlier version may lack the field, which then has its default.
+            before = there.get(name, getattr(Config, name, None))
             if before != here[name]:
                 raise UserError(
                     f"{self.where} has {name}={before}, and the new training "
@@ -124,8 +125,8 @@ class Start:
 
     @functools.cached_property
     def _read(self) -> tuple[dict[str, np.ndarray], Any]:
-        """The arrays from which training continues, by their names in the checkpoint, and the
-        identity of its lane. The replay is left out."""
+        """The arrays that a new lane takes over, by their names in the checkpoint, and the identity
+        of the checkpoint's lane; without the replay."""
         assert self.checkpoint is not None
         arrays, about = read_arrays(self.checkpoint)
         places = tuple(f".{name}{mark}" for name in _TAKEN for mark in ".[")
@@ -153,7 +154,7 @@ def starts_of_path(path: str | Path, seeds: tuple[int, ...]) -> dict[int, Start]
     """The start of each seed, from a saved policy or the ``checkpoint_dir`` of a `rtd.train`.
 
     Raises:
-        UserError: when there is neither, or a seed has no checkpoint there.
+        UserError: when ``path`` is neither of these, or has no checkpoint of a seed.
     """
     path = user_path(path)
     if not path.is_dir():

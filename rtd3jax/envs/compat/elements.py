@@ -1,4 +1,4 @@
-"""Checks of what a user chooses of a wrapped environment: observed elements and a time limit."""
+"""Checks of a user's choices for a wrapped environment: the observed elements and a time limit."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -13,7 +13,7 @@ def kept_elements(keep: Iterable[int] | slice | None, size: int, name: str) -> t
     Args:
         keep: the indices, or a slice; None for all.
         size: the number of elements of the whole observation.
-        name: of the environment, for messages.
+        name: the environment's name, for messages.
 
     Raises:
         UserError: unless the indices are distinct integers from 0 to ``size`` - 1, at least one.

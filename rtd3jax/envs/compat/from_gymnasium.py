@@ -1,4 +1,4 @@
-"""`from_gymnasium`: any Gymnasium environment for the trainer."""
+"""`from_gymnasium`: wraps any Gymnasium environment for the trainer."""
 
 import hashlib
 import math
@@ -14,10 +14,10 @@ from rtd3jax.envs.compat.surface import surface_of
 from rtd3jax.errors import UserError, nearest, short_reason, typed_reason
 
 PREFIX = "gymnasium:"
-"""Before an id of Gymnasium's where an environment is named."""
+"""The prefix of an id of Gymnasium in the name of an environment."""
 
 STEP_SECONDS = 60.0
-"""The longest that a call of a simulator may take by default."""
+"""Default limit of the duration of one call of a simulator, in seconds."""
 
 
 def from_gymnasium(
@@ -28,23 +28,24 @@ def from_gymnasium(
     step_seconds: float = STEP_SECONDS,
     **kwargs: Any,
 ) -> FromGymnasium:
-    """A Gymnasium environment for `train`, `disturb`, `evaluate` and all else.
+    """Wrap a Gymnasium environment as a gymnax environment, for training and evaluation.
 
     ``rtd.from_gymnasium("HalfCheetah-v5", keep=slice(8))`` hides the velocities. The simulator runs
-    on the host, an instance for each lane and each episode of an evaluation. Every episode begins
-    with ``reset(seed=...)``, its seed drawn from the lane's.
+    on the host; each lane and each episode of an evaluation has its own instance. Every episode
+    begins with ``reset(seed=...)``, whose seed is drawn from the random numbers of the lane.
 
     Args:
-        env: an id, or a function without arguments that makes an environment.
-        keep: indices, or a slice, of the elements that are seen; all by default. Dict and Tuple
+        env: an id, or a function that makes an environment.
+        keep: indices of the observed elements, or a slice; all by default. Dict and Tuple
             observations are concatenated first; ``element_names`` names the elements.
-        max_steps_in_episode: the time limit, a truncation; the environment's own by default, else
-            10,000.
-        step_seconds: the longest that a call may take before its lane is lost; 60 by default.
-        **kwargs: to ``gymnasium.make`` or the function.
+        max_steps_in_episode: the time limit, a truncation; by default the environment's own limit,
+            or else 10,000.
+        step_seconds: limit of the duration of one call of the simulator, in seconds; a lane whose
+            simulator exceeds it is lost.
+        **kwargs: arguments of ``gymnasium.make``, or of the function.
 
     Raises:
-        UserError: for what cannot be made or learned from, with the remedy.
+        UserError: if the environment cannot be made, or cannot be used for training.
     """
     title = env if isinstance(env, str) else getattr(env, "__name__", type(env).__name__)
     if isinstance(env, gymnasium.Env | gymnasium.vector.VectorEnv):
@@ -78,10 +79,10 @@ _known: dict[tuple, Fleet] = {}
 
 
 def _named(kwargs: dict[str, Any]) -> str:
-    """Keywords in a form that differs where they do: arrays print a part of themselves alone."""
+    """A text that differs for different keywords, unlike ``repr``, which shortens large arrays."""
     try:
         code = pickle.dumps(sorted(kwargs.items()))
-    except Exception:  # what cannot be pickled is the same as itself alone
+    except Exception:  # an object that cannot be pickled only equals itself
         return repr([(name, id(value)) for name, value in sorted(kwargs.items())])
     return hashlib.sha256(code).hexdigest()[:16] if kwargs else ""
 

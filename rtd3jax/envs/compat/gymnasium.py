@@ -114,7 +114,7 @@ class GymnasiumEnv(gymnasium.Env):
         return observation, float(reward), bool(terminated), bool(truncated), info
 
     def close(self) -> None:
-        """The simulator of this episode, if one plays it, is free for another."""
+        """End the episode; its simulator, if there is one, becomes free for another episode."""
         self._release()
         self._over = True
         super().close()
@@ -160,7 +160,7 @@ def to_gymnasium(env: Any, *, params: Any = None, render_mode: str | None = None
     Args:
         env: the environment; its time limit is reported as ``truncated``.
         params: the environment's parameters; its default parameters by default.
-        render_mode: ``rgb_array`` if ``render`` shall return pictures, or None.
+        render_mode: ``rgb_array``, so that ``render`` returns pictures, or None.
 
     Raises:
         UserError: if ``env`` is not a gymnax >= 1.0 environment, or in a forked process.

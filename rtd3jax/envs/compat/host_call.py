@@ -17,9 +17,16 @@ def host_call(
     due: Callable[[jax.Array], jax.Array] | None,
     *arguments: jax.Array,
 ) -> tuple[jax.Array, ...]:
-    """The host's answers; side by side, one call asks for all of them, in their order.
+    """Call a function on the host from a compiled program.
 
-    With ``due``, of the first argument, the host is called where it is true; else zeros.
+    Under vmap, one call from the program runs ``host`` for all members, one after the other.
+
+    Args:
+        host: a function of numpy arrays that returns a tuple of arrays.
+        shapes: shape and dtype of each array that ``host`` returns.
+        due: a function of the first argument, with the axes of vmap, that returns a bool []. If it
+            is false, ``host`` is not called, and the results are zeros. None means always true.
+        *arguments: the arguments of ``host``.
     """
     arguments = tuple(map(jnp.asarray, arguments))
     ranks = [argument.ndim for argument in arguments]
@@ -69,10 +76,10 @@ def _ask(
     results: tuple[jax.ShapeDtypeStruct, ...],
     *given: jax.Array,
 ) -> tuple[jax.Array, ...]:
-    """One call of ``on_host``, whose arguments are arrays that it must not keep.
+    """Call ``on_host`` once; it must not keep its arguments.
 
-    A CPU's own memory is read and written in place: `io_callback` makes a device's array of every
-    argument first, which takes twenty times as long as the rest of the call.
+    On a CPU, the arrays are read and written in place. `io_callback` would first make a device
+    array of every argument, which takes twenty times as long as the rest of the call.
     """
 
     def in_place(context: object, out: Sequence[Buffer], *given: Buffer) -> None:

@@ -1,4 +1,4 @@
-"""Resets where episodes end, and only there."""
+"""A step with an automatic reset that is computed only at the end of an episode."""
 
 from collections.abc import Callable
 from typing import Protocol
@@ -19,7 +19,7 @@ class ResettableWhere(Protocol):
 def step_with_reset(
     env: ResettableWhere, key: jax.Array, state: object, action: ArrayLike, params: object
 ) -> tuple:
-    """gymnax's step for an environment with ``reset_where``, which resets only at an end."""
+    """As gymnax's ``step``, but ``env.reset_where`` resets only at the end of an episode."""
     key_step, key_reset = jax.random.split(key)
     final, evolved, reward, terminated, info = env.step_env(key_step, state, action, params)
     truncated = env.is_truncated(evolved, params)

@@ -1,4 +1,4 @@
-"""Questions about an environment that a simulator on the host may play."""
+"""Finds the simulators on the host behind an environment."""
 
 import jax
 import numpy as np
@@ -17,7 +17,7 @@ def innermost(env: object) -> object:
 
 
 def fleet_of(env: object) -> Fleet | None:
-    """The simulators of the environment, disturbed or not; None where it has none."""
+    """The simulators of the environment, disturbed or not; None if it has none."""
     base = innermost(env)
     return base.fleet if isinstance(base, FromGymnasium) else None
 
@@ -28,7 +28,7 @@ def is_simulated(env: object) -> bool:
 
 
 def simulated_identity(env: object) -> str:
-    """The construction of a simulator's environment, as checkpoints store it."""
+    """A text that states how a simulated environment was made, as checkpoints store it."""
     base = innermost(env)
     assert isinstance(base, FromGymnasium)
     made, kwargs, keep, limit, _ = base.identity()
@@ -37,7 +37,10 @@ def simulated_identity(env: object) -> str:
 
 
 def release(env: object, env_state: object) -> None:
-    """Within a program: the simulators of a state, or of several, are free for other episodes."""
+    """Make the simulators of one state, or of several, free for other episodes.
+
+    A compiled program may call this function.
+    """
     states = jax.tree.leaves(env_state, is_leaf=lambda part: isinstance(part, SimulatorState))
     base = innermost(env)
     for state in states:

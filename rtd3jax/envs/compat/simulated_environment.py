@@ -1,7 +1,7 @@
-"""A simulator on the host behind gymnax's interface, called by the compiled program.
+"""A simulator on the host behind gymnax's interface; the compiled program calls it.
 
-The state names the simulator and has what replays its episode, so that it is complete: a lane that
-is resumed goes on where it was, if the simulator is deterministic.
+The state contains the simulator's handle, and the seed and actions of its episode, which can replay
+it. So a lane that is resumed continues at the same step, if the simulator is deterministic.
 """
 
 import math
@@ -50,12 +50,12 @@ class FromGymnasium(ValueIdentity, environment.Environment):
 
     @property
     def name(self) -> str:
-        """The id, or the name of the environment's class."""
+        """The id, or the name of the function that makes the environment."""
         return self._title
 
     @property
     def element_names(self) -> tuple[str, ...]:
-        """A name for each element that is seen."""
+        """A name for each observed element."""
         names = self._surface.names
         return tuple(names[index] for index in self._surface.keep)
 
@@ -70,13 +70,13 @@ class FromGymnasium(ValueIdentity, environment.Environment):
         return math.prod(self._surface.actions.shape)
 
     def action_space(self, params: SimulatorParams | None = None) -> spaces.Box:
-        """The environment's own bounds, element by element."""
+        """A Box with the environment's own bounds."""
         box = self._surface.actions
         low, high = (jnp.asarray(bound, jnp.float32) for bound in (box.low, box.high))
         return spaces.Box(low, high, box.shape, jnp.float32)
 
     def observation_space(self, params: SimulatorParams | None = None) -> spaces.Box:
-        """Unbounded."""
+        """A Box without bounds."""
         return spaces.Box(-jnp.inf, jnp.inf, (len(self._surface.keep),), jnp.float32)
 
     def reset_env(
@@ -97,7 +97,7 @@ class FromGymnasium(ValueIdentity, environment.Environment):
     def reset_where(
         self, where: jax.Array, key: jax.Array, state: SimulatorState, params: SimulatorParams
     ) -> tuple[jax.Array, SimulatorState]:
-        """Begin an episode in the state's simulator where ``where`` (bool []) is true."""
+        """Begin an episode in the state's simulator if ``where`` (bool []) is true."""
         seed = jax.random.bits(key, (), jnp.uint32) >> jnp.uint32(1)
         shapes = ((), jnp.int32), ((len(self._surface.keep),), jnp.float32), ((2,), jnp.uint32)
         handle, observation, digest = host_call(
@@ -119,7 +119,7 @@ class FromGymnasium(ValueIdentity, environment.Environment):
         action: ArrayLike,
         params: SimulatorParams,
     ) -> tuple[jax.Array, SimulatorState, jax.Array, jax.Array, dict[Any, Any]]:
-        """One step of the simulator; without an automatic reset."""
+        """One step of the simulator, without automatic reset."""
         action = jnp.asarray(action, jnp.float32).reshape(-1)
         size = len(self._surface.keep)
         shapes = (
@@ -132,7 +132,8 @@ class FromGymnasium(ValueIdentity, environment.Environment):
             (action.shape, jnp.float32),
         )
         place = state.handle, state.seed, state.time, state.digest
-        # XLA may compute an action twice, by two roundings: what the host got is what is kept.
+        # XLA may compute an action twice, with different rounding. So the host returns the action
+        # that it received, and the state stores it.
         handle, observation, reward, terminated, truncated, digest, action = host_call(
             self._step, shapes, None, *place, action, state.actions
         )
@@ -153,7 +154,7 @@ class FromGymnasium(ValueIdentity, environment.Environment):
     def step(
         self, key: jax.Array, state: object, action: ArrayLike, params: object = None
     ) -> tuple:
-        """One step; the next episode begins where this one ended, and only there."""
+        """One step with automatic reset; the simulator is reset only at the end of an episode."""
         params = self.default_params if params is None else params
         return step_with_reset(self, key, state, action, params)
 
@@ -166,7 +167,7 @@ class FromGymnasium(ValueIdentity, environment.Environment):
         return state.truncated | (state.time >= params.max_steps_in_episode)
 
     def _reset(self, where: np.ndarray, handle: np.ndarray, seed: np.ndarray) -> tuple:
-        """On the host."""
+        """The part of `reset_where` that runs on the host."""
         observation = np.zeros(len(self._surface.keep), np.float32)
         if not where:
             return handle, observation, SEED_DIGEST
@@ -186,7 +187,7 @@ class FromGymnasium(ValueIdentity, environment.Environment):
         action: np.ndarray,
         past: np.ndarray,
     ) -> tuple:
-        """On the host."""
+        """The part of `step_env` that runs on the host."""
         place = _place(seed, time, digest)
         try:
             found, simulator = self.fleet.at(int(handle), place, self._commands(past))
@@ -205,7 +206,7 @@ class FromGymnasium(ValueIdentity, environment.Environment):
         return found, *answer, action
 
     def check_params(self, params: SimulatorParams) -> None:
-        """Raise UserError where episodes would be longer than those that its state can hold."""
+        """Raise UserError if the time limit exceeds the number of actions that the state holds."""
         limit = params.max_steps_in_episode
         if isinstance(limit, jax.core.Tracer):
             return  # the simulator itself refuses
@@ -222,10 +223,11 @@ class FromGymnasium(ValueIdentity, environment.Environment):
         return lambda count: [self._surface.command(row) for row in rows[:count]]
 
     def restored(self, state: SimulatorState) -> SimulatorState | None:
-        """A state from another process, with simulators of this one at its places, to the bit.
+        """The state of another process, with simulators of this process at the same positions.
 
-        None where one came to another place, because it is not deterministic. Of a simulator that
-        fails, the next step says so.
+        Each simulator replays its episode. The result is None if a simulator reaches another
+        position, which means that it is not deterministic. If a simulator fails, the next step
+        reports its fault.
         """
         if state.handle.ndim:
             rows = range(state.handle.shape[0])
@@ -236,7 +238,7 @@ class FromGymnasium(ValueIdentity, environment.Environment):
         place = _place(state.seed, state.time, state.digest)
         past = self._commands(np.asarray(state.actions))
         try:
-            # Handles are a process's own: what this one calls so is another lane's.
+            # A handle is valid in one process. Here, the same number may belong to another lane.
             found, simulator = self.fleet.at(-1, place, past)
         except Fault as fault:
             return state.replace(handle=jnp.int32(fault.args[1]))
@@ -248,7 +250,7 @@ class FromGymnasium(ValueIdentity, environment.Environment):
 
 
 def _place(seed: _Whole, time: _Whole, digest: ArrayLike) -> tuple[int, int, tuple[int, int]]:
-    """The position of a simulator as `Fleet.at` takes it: seed, time and digest."""
+    """The position of a simulator for `Fleet.at`: seed, time and digest."""
     first, second = np.asarray(digest).tolist()
     return int(seed), int(time), (first, second)
 
@@ -264,7 +266,7 @@ _told: set[tuple[str, int]] = set()
 
 
 def _report(name: str, fault: Fault) -> None:
-    """Say a fault once for each simulator."""
+    """Report a fault once for each simulator."""
     told = name, int(fault.args[1])
     if told not in _told:
         _told.add(told)

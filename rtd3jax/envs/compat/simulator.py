@@ -24,20 +24,21 @@ from jax.typing import ArrayLike
 from rtd3jax.errors import UserError, short_reason, typed_reason
 
 MOST = 1_024
-"""Simulators that are open at once, before the one that was used longest ago is closed."""
+"""Limit of the simulators in use. A further episode takes the one that was used longest ago; if the
+episode of this simulator continues, another simulator replays it."""
 
 SEED_DIGEST = (0, 0)
 
 _CLOSING_SECONDS = 5.0
-"""The longest that is waited for a simulator to close."""
+"""Longest wait for a simulator to close, in seconds."""
 
 
 class Fault(Exception):
-    """A fault of a simulator, in one line."""
+    """A fault of a simulator: its message in one line, and then its handle from `faults_of`."""
 
 
 class _Thread:
-    """A thread that does one call after another, so that one that hangs can be left behind."""
+    """A thread that runs one call after another; a thread whose call hangs can be abandoned."""
 
     def __init__(self) -> None:
         self._calls: queue.SimpleQueue = queue.SimpleQueue()
@@ -48,7 +49,7 @@ class _Thread:
         while (call := self._calls.get()) is not None:
             try:
                 self._answers.put((call(), None))
-            except BaseException as error:  # told to the caller
+            except BaseException as error:  # `do` raises it in the thread of the caller
                 self._answers.put((None, error))
 
     def do(self, call: Callable[[], Any], seconds: float) -> Any:
@@ -69,9 +70,9 @@ class Simulator:
     """One instance of an environment.
 
     Args:
-        make: makes it.
-        read: takes an observation apart: float64 [S], all elements.
-        step_seconds: the longest that one call may take.
+        make: a function that makes the environment.
+        read: a function that flattens an observation to all its elements, float64 [S].
+        step_seconds: limit of the duration of one call, in seconds.
     """
 
     def __init__(
@@ -87,7 +88,11 @@ class Simulator:
         self._closed = False
 
     def reset(self, seed: int) -> np.ndarray:
-        """The first observation of the episode, float64 [S]."""
+        """Begin an episode; return its first observation, float64 [S].
+
+        Raises:
+            Fault: when the simulator fails.
+        """
         self.place = None
         if self._env is None:
             self._env = self._call("the factory", self._make)
@@ -99,7 +104,11 @@ class Simulator:
         return observation
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
-        """Observation [S], reward, terminated, truncated."""
+        """One step; return observation [S], reward, terminated and truncated.
+
+        Raises:
+            Fault: when the simulator fails.
+        """
         if self.fault is not None:
             raise Fault(self.fault)
         assert self.place is not None
@@ -123,13 +132,13 @@ class Simulator:
         return observation, reward, bool(answer[2]), bool(answer[3])
 
     def close(self) -> None:
-        """Close it, unless it hangs; a second time does nothing."""
+        """Close the environment, unless its thread hangs; further calls have no effect."""
         self.place = None
         if self._closed:
             return
         self._closed = True
         if self._env is not None:
-            with contextlib.suppress(BaseException):  # nothing is left to be lost
+            with contextlib.suppress(BaseException):  # the environment is not needed any more
                 self._thread.do(self._env.close, min(_CLOSING_SECONDS, self._seconds))
         self._thread.end()
 
@@ -178,7 +187,7 @@ def _digest(before: tuple[int, int], observation: np.ndarray, reward: float) -> 
 
 @contextlib.contextmanager
 def faults_of(handle: int) -> Iterator[None]:
-    """A fault within has the simulator's handle as its second argument."""
+    """A context that adds the simulator's handle to a `Fault`, as its second argument."""
     try:
         yield
     except Fault as fault:
@@ -189,7 +198,7 @@ class Fleet:
     """All simulators of one environment in this process; every method may be called by any thread.
 
     Args:
-        make: makes one.
+        make: a function that makes one environment.
         read: see `Simulator`.
         step_seconds: see `Simulator`.
     """
@@ -205,7 +214,10 @@ class Fleet:
         _fleets.append(self)
 
     def reset(self, handle: int, seed: int) -> tuple[int, np.ndarray, tuple[int, int]]:
-        """Begin an episode in the simulator of ``handle``, or in another: its handle, [S], digest.
+        """Begin an episode in the simulator of ``handle``, or in another if there is none.
+
+        Returns:
+            The simulator's handle, the first observation [S], and the digest.
 
         Raises:
             Fault: with the simulator's handle as its second argument.
@@ -222,9 +234,22 @@ class Fleet:
         place: tuple[int, int, tuple[int, int]],
         past: Callable[[int], Sequence[np.ndarray]],
     ) -> tuple[int, Simulator | None]:
-        """The simulator at ``place`` (seed, time, digest), replayed from its actions if need be.
+        """The simulator at ``place``, and its handle.
 
-        None where the replay came to another place: the simulator is not deterministic.
+        If the simulator of ``handle`` is at another position, another simulator replays the
+        episode.
+
+        Args:
+            handle: the handle in the state of the lane.
+            place: seed, time and digest.
+            past: a function that returns the first actions of the episode, for their number.
+
+        Returns:
+            The handle, and the simulator; None instead of the simulator if the replay reached
+            another position, because the simulator is not deterministic.
+
+        Raises:
+            Fault: with the simulator's handle as its second argument.
         """
         with self._lock:
             simulator = self._busy.get(handle)
@@ -242,7 +267,7 @@ class Fleet:
         return handle, simulator if simulator.place == place else None
 
     def release(self, handle: int) -> None:
-        """The simulator is free for another episode."""
+        """Make the simulator free for another episode, unless it has failed."""
         with self._lock:
             simulator = self._busy.get(handle)
             if simulator is not None and simulator.fault is None:
@@ -251,10 +276,10 @@ class Fleet:
 
     @contextlib.contextmanager
     def in_use(self) -> Iterator[None]:
-        """While anyone is within, free simulators stay open for further episodes.
+        """A context in which free simulators stay open for further episodes.
 
-        Then they are closed, and those that failed, which are of no use to anyone. Others that are
-        busy stay open: they may be another's.
+        At the end of the last such context, free and failed simulators are closed. Busy simulators
+        stay open, because other code may use them.
         """
         with self._lock:
             self._users += 1
@@ -272,9 +297,9 @@ class Fleet:
 
     @contextlib.contextmanager
     def for_a_while(self) -> Iterator[None]:
-        """At the end, simulators that were taken in between are closed, also if they are busy.
+        """A context; at its end, all simulators that were taken in it are closed, even busy ones.
 
-        Those that another thread took meanwhile are replayed when it asks for them.
+        If another thread took one of them, its episode is replayed when this thread needs it.
         """
         before = set(self._busy)
         with self.in_use():
@@ -284,7 +309,7 @@ class Fleet:
                 self.drop(set(self._busy) - before)
 
     def drop(self, handles: Iterable[int]) -> None:
-        """Close these; one that failed keeps its fault, for whoever asks what became of it."""
+        """Close the simulators of these handles; `fault` still knows the faults of failed ones."""
         with self._lock:
             own = {handle: self._busy[handle] for handle in handles if handle in self._busy}
             for handle, simulator in own.items():
@@ -294,7 +319,7 @@ class Fleet:
             simulator.close()
 
     def close(self) -> None:
-        """Close all; a place that is asked for later is replayed."""
+        """Close all simulators; a position that is needed later is replayed."""
         with self._lock:
             simulators = [*self._busy.values(), *self._free]
             faults = {h: s for h, s in self._busy.items() if s.fault is not None}
@@ -304,12 +329,12 @@ class Fleet:
 
     @property
     def count(self) -> int:
-        """Simulators that are open."""
+        """Number of open simulators."""
         with self._lock:
             return len(self._free) + sum(s.fault is None for s in self._busy.values())
 
     def fault(self, handle: int) -> str | None:
-        """The fault of a simulator."""
+        """The fault of the simulator of this handle; None without a fault or a simulator."""
         with self._lock:
             simulator = self._busy.get(handle)
             return None if simulator is None else simulator.fault
@@ -342,13 +367,13 @@ def fault_of(handle: int) -> str | None:
 
 @atexit.register
 def close_simulators() -> None:
-    """Close every simulator of this process that is open; those asked for later are made anew."""
+    """Close all simulators of this process; a simulator that is needed later is made again."""
     for fleet in list(_fleets):
         fleet.close()
 
 
 def say(message: str) -> None:
-    """Warn in a thread in which nothing may be raised."""
+    """Issue a warning; print it if warnings are errors, because a host callback must not raise."""
     try:
         warnings.warn(message, stacklevel=3)
     except Warning:

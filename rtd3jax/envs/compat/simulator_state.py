@@ -1,4 +1,4 @@
-"""A simulator's part of an environment's state, and where it lies in states of others."""
+"""The state of a simulator within an environment's state, and functions that find it there."""
 
 from typing import Any
 
@@ -8,26 +8,26 @@ from flax import struct
 
 
 class SimulatorState(struct.PyTreeNode):
-    """One episode, and all that replays it."""
+    """The state of one episode, from which the episode can be replayed."""
 
     time: jax.Array
     """int32 []: steps taken"""
     handle: jax.Array
-    """int32 []: the simulator, in the process that made it"""
+    """int32 []: handle of the simulator, valid in the process that made it"""
     seed: jax.Array
-    """uint32 []: with which the episode began"""
+    """uint32 []: seed of the episode's reset"""
     digest: jax.Array
-    """uint32 [2]: of all that the simulator answered in this episode, to the bit"""
+    """uint32 [2]: hash of all observations and rewards of the episode"""
     actions: jax.Array
-    """float32 [T, A]: those of this episode"""
+    """float32 [T, A]: actions of the episode; T is the largest number of steps"""
     terminated: jax.Array
     """bool []"""
     truncated: jax.Array
-    """bool []: by the environment itself"""
+    """bool []: whether the simulator itself reported a truncation"""
 
 
 def simulator_state(env_state: object) -> SimulatorState | None:
-    """The part of an environment's state that is a simulator's; None where there is none."""
+    """The simulator's state within an environment's state; None without a simulator."""
     parts = jax.tree.leaves(env_state, is_leaf=lambda part: isinstance(part, SimulatorState))
     return next((part for part in parts if isinstance(part, SimulatorState)), None)
 
@@ -39,7 +39,7 @@ def simulator_handles(env_state: object) -> list[int]:
 
 
 def with_simulator(env_state: object, simulator: SimulatorState) -> Any:
-    """An environment's state with another state of its simulator."""
+    """An environment's state, in which ``simulator`` replaces the simulator's state."""
     return jax.tree.map(
         lambda part: simulator if isinstance(part, SimulatorState) else part,
         env_state,
@@ -48,7 +48,7 @@ def with_simulator(env_state: object, simulator: SimulatorState) -> Any:
 
 
 def without_handles(tree: object) -> Any:
-    """A result with the numbers of its simulators, which every call gives anew, set to zero."""
+    """``tree`` with all simulators' handles set to zero, because every call returns new handles."""
 
     def plain(part: object) -> object:
         return part.replace(handle=0 * part.handle) if isinstance(part, SimulatorState) else part

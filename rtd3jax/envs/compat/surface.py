@@ -1,4 +1,4 @@
-"""The outside of a Gymnasium environment: its actions, and a vector of what it shows."""
+"""The spaces of a Gymnasium environment: its actions, and its observation as a vector."""
 
 import dataclasses
 import functools
@@ -16,12 +16,12 @@ from rtd3jax.errors import UserError
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Surface:
-    """The spaces of an environment, and the elements of its observation that an agent sees.
+    """The spaces of an environment, and the observed elements.
 
     Attributes:
         actions: the action space.
         names: a name for each element of the whole observation.
-        keep: indices of the elements that an agent sees.
+        keep: indices of the observed elements.
         limit: the time limit, in steps.
     """
 
@@ -41,7 +41,7 @@ class Surface:
         return self.actions.low.astype(np.float64), self.actions.high.astype(np.float64)
 
     def command(self, action: np.ndarray) -> np.ndarray:
-        """``action`` [A] as the environment gets it: within its bounds, of its type."""
+        """``action`` [A] within the bounds, with the shape and the dtype of the action space."""
         low, high = self.bounds
         wide = action.astype(np.float64).reshape(low.shape)
         within = np.minimum(np.maximum(wide, low), high)
@@ -66,7 +66,8 @@ def surface_of(
         limit: the time limit in steps; None for the environment's own.
 
     Raises:
-        UserError: for spaces that an agent cannot use, or for such elements or such a limit.
+        UserError: for spaces that cannot be used for training, or an impossible ``keep`` or
+            ``limit``.
     """
     actions, seen = example.action_space, example.observation_space
     if not isinstance(actions, gymnasium.spaces.Box):

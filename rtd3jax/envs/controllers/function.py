@@ -46,7 +46,7 @@ class FunctionPolicy:
                 f"{name} must return a state of the same shapes as its argument: {shapes[0]}, "
                 f"not {shapes[1]}"
             )
-        # A loop needs a state of fixed types, which a Python number in the sum must not change.
+        # A loop needs a state of fixed types, but Python numbers in the function may change them.
         after = jax.tree.map(lambda new, old: jnp.asarray(new).astype(old.dtype), after, state)
         return jnp.atleast_1d(jnp.asarray(action, jnp.float32)), after
 

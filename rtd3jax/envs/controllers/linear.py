@@ -18,13 +18,17 @@ from rtd3jax.protocols import EnvironmentLike
 
 
 class Linear(NamedTuple):
-    """A linearised step, float64: S elements of the state, A of the action, O observed elements."""
+    """A linearised step, float64: S elements of the state, A of the action, O observed elements.
+
+    ``curvature`` holds the second derivatives of half the negative reward: by the state [S, S], by
+    the action [A, A], and by both [S, A]. ``names`` are the names of the S elements.
+    """
 
     a: np.ndarray  # [S, S]
     b: np.ndarray  # [S, A]
     c: np.ndarray  # [O, S]
     drift: np.ndarray  # [S], change of the state in one step
-    at: np.ndarray  # [O]
+    at: np.ndarray  # [O], the observation after the step
     action: np.ndarray  # [A]
     curvature: tuple[np.ndarray, np.ndarray, np.ndarray]
     names: list[str]
@@ -40,7 +44,8 @@ def linearised(
     """The undisturbed step and the observation of ``env``, linearised at a state and an action.
 
     Raises:
-        UserError: if JAX cannot differentiate the step there.
+        UserError: if JAX cannot differentiate the step there, if the action has no effect, or if it
+            is not known which elements of the state ``env`` observes.
     """
     base: Any = env.base if isinstance(env, Disturbed) else env
     base_params = params.env if isinstance(env, Disturbed) else params

@@ -25,9 +25,9 @@ class LinearPolicy:
     gain: jax.Array
     """float32 [A, O]"""
     at: jax.Array
-    """float32 [O], the observation of the resting state"""
+    """float32 [O], the observation of the equilibrium"""
     action: jax.Array
-    """float32 [A], the action of the resting state"""
+    """float32 [A], the action of the equilibrium"""
     low: jax.Array
     high: jax.Array
     action_shape: tuple[int, ...] = struct.field(pytree_node=False)
@@ -124,10 +124,11 @@ def lqr_policy(
 def riccati_gain(
     a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray, cross: np.ndarray
 ) -> np.ndarray:
-    """The gain K [A, S] of ``u = -K x`` that minimises the sum of ``x'qx + 2 x'cross u + u'ru``.
+    """The gain K [A, S] of ``u = -K x`` that minimises a quadratic cost.
 
-    ``x' = a x + b u`` with a [S, S] and b [S, A]. Elements that are not controllable are allowed if
-    they decay by themselves.
+    The cost is the sum of ``x^T q x + 2 x^T cross u + u^T r u`` over all steps, with q [S, S],
+    r [A, A] and cross [S, A]. The next state is ``a x + b u``, with a [S, S] and b [S, A]. Elements
+    that are not controllable are allowed if they decay by themselves.
 
     Raises:
         UserError: when the iteration does not converge, because an element with a cost cannot be

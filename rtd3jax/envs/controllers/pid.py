@@ -84,8 +84,8 @@ def pid_policy(
     """A PID controller for each element of the action, with feed-forward and anti-windup.
 
     ``action = feedforward + kp e + ki sum(e) seconds + kd change(e) / seconds`` within the bounds
-    of ``env``, with ``e = setpoint - observation[elements]``. All arguments except ``seconds`` and
-    ``ignored`` are numbers or arrays [A].
+    of ``env``, with ``e = setpoint - observation[elements]``. Gains, set-point and feed-forward are
+    numbers or arrays [A].
 
     Args:
         env: the environment, which defines sizes and bounds; it may be disturbed.

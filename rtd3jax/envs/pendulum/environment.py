@@ -24,7 +24,8 @@ __all__ = ["Pendulum", "PendulumParams", "PendulumState"]
 class Pendulum(ValueIdentity, pendulum.Pendulum):
     """gymnax's dynamics and reward, unchanged, in float32 also under JAX_ENABLE_X64.
 
-    gymnax's own would begin in float64 there and go on in float32, which no loop takes.
+    With gymnax's own code, a state would begin in float64 there and continue in float32, and JAX's
+    loops refuse such a change.
     """
 
     def reset_env(self, key: jax.Array, params: PendulumParams) -> tuple[jax.Array, PendulumState]:

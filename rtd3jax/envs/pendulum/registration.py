@@ -36,5 +36,5 @@ register(
         constants=("max_torque",),
         step_seconds="dt",
     ),
-    try_disturbances=False,  # the tests do so; the import stays fast
+    try_disturbances=False,  # the tests trace them; the import stays fast
 )

@@ -30,7 +30,7 @@ def optimal_value(
     """The optimal return of each state at the start of an episode.
 
     Args:
-        params: of the pendulum; its numbers must be plain.
+        params: the pendulum's parameters, as Python numbers, because they are hashed.
         angles: grid intervals over a full turn, from -pi; the angle is periodic.
         speeds: grid intervals over the speed's range.
 
@@ -50,7 +50,7 @@ def optimal_values(
     """The optimal return of each state with 0, 1, ..., ``steps`` - 1 remaining steps.
 
     Args:
-        params: of the pendulum; its numbers must be plain.
+        params: as in `optimal_value`.
         angles: as in `optimal_value`.
         speeds: as in `optimal_value`.
         steps: number of value functions.

@@ -19,7 +19,7 @@ class Process(TypedNode):
     """Base of every process. A signal is a float vector, such as an observation [O]."""
 
     begins_later: ClassVar[bool] = False
-    """Whether it acts from a step on that is drawn from the whole episode."""
+    """Whether the process begins to act at a random step of the episode."""
 
     def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> Any:
         """Draw the state for an episode of ``horizon`` steps (may be traced) and signals [size]."""
@@ -67,7 +67,7 @@ class Composition(Process):
     processes: tuple[Process, ...] = ()
 
     def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> Any:
-        """The tuple of the members' states, each of the same signal, with its own random stream."""
+        """The members' states as a tuple; every member has the same signal and its own stream."""
         return tuple(
             process.init(jax.random.fold_in(key, index), horizon, size)
             for index, process in enumerate(self.processes)

@@ -159,7 +159,7 @@ class Recorded(Process):
     def _starts(self, lengths: jax.Array, horizon: jax.Array) -> jax.Array:
         """Number of rows [E] of each recording at which an episode may start."""
         fitting = jnp.maximum(lengths - (self._needed(horizon) - 1), 0)
-        # With a traced horizon, nothing has refused an episode that is too long: it is mirrored.
+        # `check_use` cannot check a traced horizon. If no recording is long enough, it is mirrored.
         anywhere = self.mirror | ~jnp.any(fitting > 0)
         return jnp.where(anywhere & (fitting == 0), lengths, fitting)
 

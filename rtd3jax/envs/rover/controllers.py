@@ -20,10 +20,10 @@ def constant_command(env: EnvironmentLike) -> tuple[Any, Any]:
 
 
 def target_pi(env: EnvironmentLike, kp: float, ki: float) -> PIDPolicy | None:
-    """Feed-forward of the target, and a PI controller of both errors; None if one is not observed.
+    """Feed-forward of the target, and a PI controller of both errors.
 
-    The controller ignores the first observation: the rover is then at rest, which no command has
-    caused.
+    The result is None if an error is not observed. The controller ignores the first observation:
+    the rover is then at rest, which no command has caused.
     """
     if describe(env, env.default_params).observation_size != 2:
         return None

@@ -14,17 +14,17 @@ from rtd3jax.protocols import EnvironmentLike
 
 
 def feedforward_pi(env: EnvironmentLike) -> PIDPolicy | None:
-    """Feed-forward of the target, and a PI controller of both errors; None if one is not observed.
+    """Feed-forward of the target, and a PI controller of both errors.
 
-    The gains are the best of a grid under ``ar1-slip``, on 1,000 episodes of seed 1000. They are
-    high: if observations are delayed or drift, the loop oscillates, and the constant command gives
-    higher returns.
+    The result is None if an error is not observed. The gains are the best of a grid under
+    ``ar1-slip``, on 1,000 episodes of seed 1000. They are high: if observations are delayed or
+    drift, the loop oscillates, and the constant command gives higher returns.
     """
     return target_pi(env, kp=0.1, ki=1.0)
 
 
 def next_slip(state: RoverState) -> jax.Array | None:
-    """The slip [..., 2] that acts in the next step; None without a slip process."""
+    """The slip [..., 2] that acts in the next step; None if no state has a field ``slip``."""
     parts = state.slip if type(state.slip) is tuple else (state.slip,)
     return next((part.slip for part in parts if hasattr(part, "slip")), None)
 
@@ -69,5 +69,5 @@ register(
         Stress("slip-bound", _SLIPS, _slip_bound, "largest AR(1) slip"),
     ),
     with_params=Rover,
-    try_disturbances=False,  # the tests do so; the import stays fast
+    try_disturbances=False,  # the tests trace them; the import stays fast
 )

@@ -1,7 +1,7 @@
-"""The task of a rover, whatever its wheels meet: hold a speed and a yaw rate (paper, Section 8.2).
+"""The task of every rover: hold a speed and a yaw rate (paper, Section 8.2).
 
-Units: m, s, rad. The left wheel comes first. Other rovers inherit from `DrivingTask`, so that the
-policies of one act in the others.
+Units: m, s, rad. The left wheel comes first. All rovers inherit from `DrivingTask`, so a policy of
+one rover can act in another.
 """
 
 from typing import Any, Protocol
@@ -34,7 +34,10 @@ class DrivingTask(ValueIdentity, environment.Environment):
     """Task: hold a speed and a yaw rate. Actions [2] command them; observations [2] are errors."""
 
     def outcome(self, evolved: Any, params: Any) -> tuple[Any, Any, jax.Array, jax.Array, dict]:
-        """What ``step_env`` returns for the state after a step; the reward [] is of its motion."""
+        """The values that ``step_env`` returns; ``evolved`` is the state after the step.
+
+        The reward [] is the negative squared error of the motion in this state.
+        """
         observation = errors(evolved, params)
         reward = -jnp.sum(observation**2)
         observation, evolved = self._apply_transition_gradient_policy(observation, strong(evolved))
@@ -61,18 +64,18 @@ class DrivingTask(ValueIdentity, environment.Environment):
 
 
 def limits(params: TaskParams) -> jax.Array:
-    """Largest command [2]."""
+    """Largest command [2]: m/s, rad/s."""
     return jnp.stack([float32(params.max_speed), float32(params.max_yaw_rate)])
 
 
 def sides(speed: jax.Array, yaw_rate: jax.Array, wheelbase: jax.Array) -> jax.Array:
-    """Speeds of the left and right side [2]."""
+    """Speeds of the left and right side [2], m/s."""
     turn = 0.5 * wheelbase * yaw_rate
     return jnp.stack([speed - turn, speed + turn])
 
 
 def errors(state: MotionState, params: TaskParams) -> jax.Array:
-    """Observation [2]: motion minus target."""
+    """Observation [2]: motion minus target, m/s and rad/s."""
     return jnp.stack(
         [
             state.speed - float32(params.target_speed),

@@ -15,10 +15,11 @@ from rtd3jax.protocols import EnvironmentLike
 
 
 def feedforward_pi(env: EnvironmentLike) -> PIDPolicy | None:
-    """The target fed forward, and a PI controller of both errors; None where one is not seen.
+    """Feed-forward of the target, and a PI controller of both errors.
 
-    The rover's (`rtd3jax.envs.rover.registration`) with other gains: those of
-    experiments/rover_soil_gains.py, the best of a grid on 1,000 episodes of seed 1000.
+    The result is None if an error is not observed. The gains differ from those of the rover without
+    soil: they are the best of a grid, on 1,000 episodes of seed 1000
+    (experiments/rover_soil_gains.py).
     """
     return target_pi(env, *PI_GAINS)
 
@@ -26,18 +27,18 @@ def feedforward_pi(env: EnvironmentLike) -> PIDPolicy | None:
 PI_GAINS = (0.0, 1.6)
 """(kp, ki)"""
 ESTIMATE_GAIN = 1.0
-"""Share of each new reading of the slip in the estimate; from the same search as ``PI_GAINS``."""
+"""Weight of each new measurement in the estimate of the slip; from the search of ``PI_GAINS``."""
 LARGEST_SLIP = 0.8
-"""Of the estimate: beyond it no command within the bounds helps."""
+"""Largest estimate of the slip, which limits the command."""
 
 
 class AdaptiveState(NamedTuple):
-    """What the controller remembers.
+    """The state of an `AdaptivePolicy`.
 
     Attributes:
-        command: float32 [2], rim speeds that it last commanded, m/s.
-        slip: float32 [2], its estimate.
-        time: int32 [], steps done.
+        command: float32 [2], the last commanded rim speeds, m/s.
+        slip: float32 [2], the estimated slip.
+        time: int32 [], number of steps so far.
     """
 
     command: jax.Array
@@ -47,11 +48,11 @@ class AdaptiveState(NamedTuple):
 
 @struct.dataclass
 class AdaptivePolicy:
-    """Estimate each wheel's slip, and command what it leaves of the target.
+    """Estimates the slip of each wheel, and increases the command to compensate for it.
 
-    The slip that the last command met is ``1 - hub / rim``, from the motion that was observed; the
-    estimate is its moving average with ``gain``, and the next command the target's wheel speeds
-    over ``1 - estimate``.
+    The measured slip is ``1 - hub / rim``, from the observed motion and the last commanded rim
+    speeds. The estimate is a moving average of the measurements, with weight ``gain``. The next
+    command is the target's wheel speeds divided by ``1 - estimate``.
     """
 
     wheelbase: jax.Array
@@ -60,12 +61,12 @@ class AdaptivePolicy:
     gain: jax.Array
 
     def init(self, key: jax.Array | None = None) -> AdaptiveState:
-        """No slip is known yet; ``key`` is not needed."""
+        """The state before the first step, with zero slip; ``key`` is not used."""
         zeros = jnp.zeros((2,), jnp.float32)
         return AdaptiveState(zeros, zeros, jnp.int32(0))
 
     def step(self, state: AdaptiveState, observation: jax.Array) -> tuple[jax.Array, AdaptiveState]:
-        """The command [2]."""
+        """The command [2], m/s and rad/s, and the next state."""
         hub = sides(
             observation[0] + self.target_speed,
             observation[1] + self.target_yaw_rate,
@@ -74,7 +75,7 @@ class AdaptivePolicy:
         moved = jnp.abs(state.command) > 0.05
         read = 1.0 - hub / jnp.where(moved, state.command, 1.0)
         read = jnp.where(moved, jnp.clip(read, -LARGEST_SLIP, LARGEST_SLIP), state.slip)
-        # The first reading of an episode is that of a start from rest.
+        # The first measurement is ignored: the rover has accelerated from rest.
         known = state.time > 1
         slip = jnp.where(known, state.slip + self.gain * (read - state.slip), state.slip)
         slip = jnp.clip(slip, 0.0, LARGEST_SLIP)
@@ -86,7 +87,7 @@ class AdaptivePolicy:
 
 
 def adaptive_slip(env: EnvironmentLike, gain: float = ESTIMATE_GAIN) -> AdaptivePolicy | None:
-    """The `AdaptivePolicy` of ``env``; None where an error is not seen."""
+    """The `AdaptivePolicy` for ``env``; None if an error is not observed."""
     if describe(env, env.default_params).observation_size != 2:
         return None
     params = plain_params(env)

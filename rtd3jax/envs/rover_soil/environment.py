@@ -1,11 +1,11 @@
-"""A differential-drive rover on loose soil: its slip is what the soil gives, not a process.
+"""A differential-drive rover on loose soil: the forces of the soil determine its slip.
 
-Actions, observations, rewards and bounds are the rover's (`rtd3jax.envs.rover`), so that policies
-of the one act in the other. Between them lie two driven wheels with inertia and motors of limited
-torque, the soil's forces on them (`rtd3jax.envs.rover_soil.wheel`), the inertia of the body, and
-gravity on slopes. SI units, rad; left wheel first.
+Actions, observations, rewards and bounds are those of `rtd3jax.envs.rover`, so a policy of one
+rover can act in the other. The dynamics contain two driven wheels with inertia, motors of limited
+torque, the soil's forces on the wheels (`rtd3jax.envs.rover_soil.wheel`), the inertia of the body,
+and gravity on slopes. SI units, rad. The left wheel comes first.
 
-Every number of the vehicle is a choice, but for the wheel and its load, which are those of a
+All numbers of the vehicle are choices, except the wheel and its load, which are those of a
 single-wheel test bed: radius 157.35 mm, width 165 mm, 80 N (Ding, Gao, Deng, Nagatani and Yoshida,
 "Experimental study and analysis on driving wheels' performance for planetary exploration rovers
 moving in deformable soil", J. Terramechanics 48(1), 2011).
@@ -39,7 +39,7 @@ from rtd3jax.errors import UserError
 SUBSTEPS = 4
 """Steps of the implicit integration within a step of the environment."""
 SLOWEST = 0.05
-"""m/s: below it slip is measured against this speed, and a wheel's rolling resistance fades."""
+"""m/s. At lower speeds, the slip is relative to this speed, and rolling resistance decreases."""
 
 
 class RoverSoilParams(struct.PyTreeNode):
@@ -53,33 +53,33 @@ class RoverSoilParams(struct.PyTreeNode):
     target_yaw_rate: float = 0.0
     """rad/s"""
     ground: Process = NoDisturbance()
-    """a `Ground`; without one it is dry sand, even and the same everywhere"""
+    """a `Ground`; `NoDisturbance` means level dry sand with the same properties everywhere"""
     max_speed: float = 1.0
-    """m/s, bound of the speed command, as the rover's"""
+    """m/s, bound of the speed command, as for `rtd3jax.envs.rover`"""
     max_yaw_rate: float = 1.0
-    """rad/s, bound of the yaw-rate command, as the rover's"""
+    """rad/s, bound of the yaw-rate command, as for `rtd3jax.envs.rover`"""
     step_seconds: float = 0.2
-    """s"""
+    """s, length of a step"""
     mass: float = 16.31
-    """kg, on both wheels alike"""
+    """kg; each wheel carries half of it"""
     yaw_inertia: float = 0.7
-    """kg m^2: a plate of 0.5 m by 0.5 m"""
+    """kg m^2, nearly that of a plate of 0.5 m by 0.5 m"""
     gravity: float = 9.81
-    """m/s^2: the soils were measured on Earth"""
+    """m/s^2, on Earth, where the soils were measured"""
     wheel_radius: float = 0.15735
     """m"""
     wheel_width: float = 0.165
     """m"""
     wheel_inertia: float = 0.05
-    """kg m^2, of a wheel and its motor"""
+    """kg m^2, of one wheel and its motor"""
     motor_gain: float = 40.0
-    """N m s/rad, of the loop that holds a wheel's speed"""
+    """N m s/rad, gain of the controller of a wheel's speed"""
     motor_torque: float = 10.0
-    """N m, the largest"""
+    """N m, largest torque of a motor"""
 
 
 class RoverSoilState(struct.PyTreeNode):
-    """One episode."""
+    """The state of one episode."""
 
     time: jax.Array
     """int32 []: steps taken"""
@@ -90,19 +90,19 @@ class RoverSoilState(struct.PyTreeNode):
     rim: jax.Array
     """float32 [2], speed of the wheels' rims, m/s"""
     entry: jax.Array
-    """float32 [2], entry angles, rad: the sinkage"""
+    """float32 [2], entry angles of the wheels, rad; they determine the sinkage"""
     slip: jax.Array
     """float32 [2], slip at the end of the last step"""
     place: jax.Array
-    """float32 [2], m, of the middle between the wheels"""
+    """float32 [2], position of the middle between the wheels, m"""
     heading: jax.Array
     """float32 [], rad"""
     ground: GroundState
-    """the episode's ground"""
+    """the ground of the episode"""
 
 
 class Motion(NamedTuple):
-    """What is integrated within a step.
+    """The variables that `drive` integrates over a step.
 
     Attributes:
         hub: speed of the two hubs over ground, m/s, [2].
@@ -116,7 +116,11 @@ class Motion(NamedTuple):
 
 
 class RoverSoil(DrivingTask):
-    """Hold a speed and a yaw rate: actions [2] command them, observations [2] are their errors."""
+    """Task: hold a speed and a yaw rate. Actions [2] command them; observations [2] are errors.
+
+    Raises:
+        UserError: as `check_ground`.
+    """
 
     def __init__(self, default_params: RoverSoilParams | None = None) -> None:
         super().__init__()
@@ -132,7 +136,7 @@ class RoverSoil(DrivingTask):
     def reset_env(
         self, key: jax.Array, params: RoverSoilParams
     ) -> tuple[jax.Array, RoverSoilState]:
-        """Start at rest, sunk in as the load does it without shear on the ground's first soil."""
+        """Start at rest, with the sinkage under the load without shear, on the soil ``soil``."""
         ground, zero = ground_of(params), jnp.zeros((), jnp.float32)
         soil = local_soil(ground.soil, _width(params))
         state = RoverSoilState(
@@ -184,16 +188,20 @@ class RoverSoil(DrivingTask):
 
 
 EVEN = Ground(variation=0.0)
-"""Dry sand, the same everywhere."""
+"""Level dry sand with the same properties everywhere."""
 
 
 def ground_of(params: RoverSoilParams) -> Ground:
-    """The ground of ``params``; even dry sand where there is none."""
+    """The ground of ``params``, or `EVEN` if there is none."""
     return params.ground if isinstance(params.ground, Ground) else EVEN
 
 
 def check_ground(params: RoverSoilParams) -> None:
-    """Raise UserError for another object, or a ground in which a wheel sinks below its axle."""
+    """Raise UserError if a rover cannot drive on its ground.
+
+    This is so if ``ground`` is not a `Ground`, if the wheels carry no load, or if a wheel sinks
+    below its axle at full slip. Traced numbers are not checked.
+    """
     if not isinstance(params.ground, Ground | NoDisturbance):
         kind = type(params.ground).__name__
         raise UserError(
@@ -219,32 +227,33 @@ def check_ground(params: RoverSoilParams) -> None:
 
 @jax.jit
 def _deepest(soil: Soil, wheel: Wheel, load: ArrayLike) -> jax.Array:
-    """Entry angle at full slip."""
+    """The entry angle [] at full slip, rad."""
     met = local_soil(soil, wheel.width)
     return entry_angle(met, wheel, float32(load), jnp.float32(1.0))
 
 
 def wheel_of(params: RoverSoilParams) -> Wheel:
-    """One of its wheels."""
+    """A wheel of the rover; both wheels are equal."""
     return Wheel(params.wheel_radius, params.wheel_width)
 
 
 def wheel_load(params: RoverSoilParams, slope: jax.Array) -> jax.Array:
-    """N [2], on each wheel, across the slope ``slope`` []."""
+    """The load of each wheel normal to the ground, N [2], at ``slope`` [] rad."""
     return jnp.broadcast_to(0.5 * params.mass * params.gravity * jnp.cos(slope), (WHEELS,))
 
 
 def wheel_places(params: RoverSoilParams, place: jax.Array, heading: jax.Array) -> jax.Array:
-    """The positions of the wheels, [2, 2] m."""
+    """The positions of the wheels, [2, 2] in m; a row for each wheel."""
     half = 0.5 * float32(params.wheelbase)
     across = half * jnp.stack([-jnp.sin(heading), jnp.cos(heading)])
     return jnp.stack([place + across, place - across])
 
 
 def slip_of(motion: Motion) -> jax.Array:
-    """[2]: (rim - hub) over the faster of the two: 0 rolling, 1 spinning on the spot, -1 locked.
+    """The slip [2]: (rim - hub) divided by the larger absolute value of the two speeds.
 
-    For a driven wheel it is the usual slip ratio. Below ``SLOWEST`` it fades to 0 at rest.
+    In forward motion, 0 means rolling without slip, 1 spinning on the spot, and -1 a locked wheel.
+    For a driven wheel, this is the usual slip ratio. Below ``SLOWEST``, it decreases to 0 at rest.
     """
     fastest = jnp.maximum(jnp.abs(motion.rim), jnp.abs(motion.hub))
     slip = (motion.rim - motion.hub) / jnp.maximum(fastest, SLOWEST)
@@ -258,11 +267,18 @@ def drive(
     motion: Motion,
     command: jax.Array,
 ) -> Motion:
-    """Drive for a step on ``soil`` [2] up ``slope`` [], with rim speeds ``command`` [2] m/s.
+    """Integrate the motion over one step.
 
-    ``SUBSTEPS`` linearly implicit Euler steps: the soil's forces change with the slip, and the
-    slip within hundredths of a second, so that explicit ones would have to be far shorter. The
-    sinkage, which has no inertia of its own, takes one step of its iteration in each.
+    There are ``SUBSTEPS`` linearly implicit Euler steps. The forces of the soil depend on the slip,
+    which changes within hundredths of a second, so explicit steps would have to be much shorter.
+    The sinkage has no inertia; each substep computes one iteration of `deeper`.
+
+    Args:
+        params: the rover.
+        soil: the soil under the wheels, fields [2].
+        slope: [], the slope ahead, rad.
+        motion: the motion at the start of the step.
+        command: [2], commanded rim speeds, m/s.
     """
     wheel, load = wheel_of(params), wheel_load(params, slope)
     seconds = params.step_seconds / SUBSTEPS
@@ -282,12 +298,14 @@ def drive(
         fastest = jnp.maximum(jnp.abs(motion.rim), jnp.abs(motion.hub))
         by_speed = 1.0 / jnp.maximum(fastest, SLOWEST)
         torque_rate = by_speed * forces.torque_slope
-        # That of the pull, were the contact flat: it settles the steps, and not where they lead.
+        # The derivative of the pull by the speed, for a flat contact. It affects the stability of
+        # the steps, but not the motion to which they converge.
         pull_rate = torque_rate / radius
-        # The rims: (inertia + answer + torque_rate) change = motor - torque + torque_rate * hubs'
-        # change; put into the hubs' equations, which couple the sides by the yaw inertia. The motor
-        # is at its limit where it would be beyond it at the end: one that asks at the beginning
-        # switches to and fro.
+        # The equation of the rims is (inertia + gain + torque_rate) * rim_change =
+        # motor - torque + torque_rate * hub_change, without gain for a motor at its limit. It is
+        # substituted into the equations of the hubs, which the yaw inertia couples. A motor is at
+        # its limit if its torque at the end of the substep would exceed it: a decision by the
+        # torque at the beginning would switch back and forth.
         wanted = gain * (command - motion.rim)
         within = inertia + gain + torque_rate
         late = wanted - gain * (wanted - forces.torque) / within
@@ -312,8 +330,9 @@ def drive(
         motion = jax.tree.map(lambda old, new: jnp.where(first, old, new), motion, moved)
         return (motion, forces_at(motion)), None
 
-    # The forces are carried to the next round, and the first round only computes them: within one
-    # the compiler would compute the stresses again for each of their uses, at many times the cost.
+    # The forces are carried to the next round, and the first round only computes them. If a round
+    # used the forces that it computes, XLA would compute the stresses again for each use of them,
+    # which takes many times as long.
     nothing = Forces(*(jnp.ones_like(motion.entry),) * len(Forces._fields))
     rounds = jnp.arange(SUBSTEPS + 1) == 0
     (motion, _), _ = jax.lax.scan(onwards, (motion, nothing), rounds)
@@ -321,7 +340,7 @@ def drive(
 
 
 def rolling_of(motion: Motion) -> jax.Array:
-    """[2]: 1 for a wheel that rolls forwards, -1 backwards; it passes through 0 at rest."""
+    """The direction of rolling [2]: 1 forwards, -1 backwards; it passes through 0 at rest."""
     return jnp.clip(motion.rim / SLOWEST, -1.0, 1.0)
 
 

@@ -1,11 +1,12 @@
-"""The ground: soil and slope as correlated random fields of the place, drawn anew every episode.
+"""The ground: soil and slope as correlated random fields, which are drawn in every episode.
 
-A field is a sum of waves ``sqrt(2 / M) sum_m cos(k_m . place + phase_m)`` whose phases are uniform:
-its mean is 0, its variance 1, and its covariance, over the episodes, the mean of ``cos(k_m . d)``.
-The wave vectors are chosen once, spread over the normal distribution that makes that nearly
-``exp(-|d|^2 / (2 L^2))``, with the correlation length L (Rahimi and Recht, "Random Features for
-Large-Scale Kernel Machines", 2007). So the left wheel's soil goes with the right one's, and a rover
-that comes back finds the soil that it left.
+A field is a function of the place, a sum of waves
+``sqrt(2 / M) sum_m cos(k_m . place + phase_m)`` whose phases are uniform. Its mean is 0, and its
+variance is 1. Over the episodes, the covariance of two places with the difference d is the mean of
+``cos(k_m . d)``. The wave vectors k_m are constants. They are spread over a normal distribution, so
+that the covariance is nearly ``exp(-|d|^2 / (2 L^2))``, with the correlation length L (Rahimi and
+Recht, "Random Features for Large-Scale Kernel Machines", 2007). So the soils under the two wheels
+are correlated, and a rover that returns to a place finds the same soil there.
 """
 
 from typing import Any, NamedTuple
@@ -20,18 +21,19 @@ from rtd3jax.envs.rover_soil.soil import DRY_SAND, LocalSoil, Soil, local_soil
 from rtd3jax.envs.rover_soil.wheel import cosine_of
 
 WAVES = 8
-"""M, waves of a field."""
+"""M, the number of waves of a field."""
 
 
 class Spread(NamedTuple):
-    """Standard deviations of a soil's properties about the published ones [choice].
+    """Standard deviations of a soil's properties from the published ones [choice].
 
     Attributes:
-        cohesion: of its logarithm.
-        friction_angle: degrees.
-        shear_modulus: of its logarithm.
-        pressure: of the logarithm of the pressure at a depth, and so of both sinkage moduli.
-        exponent: of its logarithm.
+        cohesion: deviation of the logarithm of the cohesion.
+        friction_angle: deviation of the friction angle, in degrees.
+        shear_modulus: deviation of the logarithm of the shear modulus.
+        pressure: deviation of the logarithm of the pressure at one depth, and so of the logarithms
+            of both sinkage moduli.
+        exponent: deviation of the logarithm of the exponent.
     """
 
     cohesion: float = 0.2
@@ -43,32 +45,32 @@ class Spread(NamedTuple):
 
 SPREAD = Spread()
 FIELDS = (*Spread._fields, "other", "height")
-"""What varies by a field of its own: the properties, the share of the other soil, the height."""
+"""The quantities with a field each: the properties, the share of the other soil, and the height."""
 SHARPNESS = 3.0
-"""Of the border between two soils [choice]: the share of the other one is a logistic function of
-its field times this."""
+"""Sharpness of the border between two soils [choice]: the share of the other soil is a logistic
+function of its field times this number."""
 
 
 class GroundState(struct.PyTreeNode):
-    """An episode's ground."""
+    """The ground of one episode."""
 
     phases: jax.Array
     """float32 [M, FIELDS], in turns"""
 
 
 class Ground(Process):
-    """Soil that varies about ``soil``, or between it and ``other``, and a slope.
+    """Soil whose properties vary around ``soil``, or between ``soil`` and ``other``, and a slope.
 
-    It disturbs no signal: the rover asks it `at` the places of its wheels.
+    The ground does not change a signal. The rover calls `at` with the places of its wheels.
     """
 
     soil: Soil = DRY_SAND
     other: Soil = DRY_SAND
-    """where the field of the share says so"""
+    """the other soil, whose share at a place is determined by a field"""
     variation: float = 1.0
-    """of the properties' standard deviations, as a share of ``SPREAD``"""
+    """factor of the standard deviations in ``SPREAD``"""
     correlation_length: float = 1.0
-    """m, of the soil [choice]"""
+    """m, correlation length of the soil [choice]"""
     slope: float = 0.0
     """degrees, standard deviation of the slope in any direction"""
     slope_length: float = 4.0
@@ -79,16 +81,23 @@ class Ground(Process):
         return GroundState(jax.random.uniform(key, (WAVES, len(FIELDS)), jnp.float32))
 
     def step(self, key: jax.Array, state: GroundState, signal: jax.Array) -> tuple[jax.Array, Any]:
-        """Nothing: a ground changes no signal by itself."""
+        """The unchanged signal and state."""
         return signal, state
 
     def at(
         self, state: GroundState, places: jax.Array, heading: jax.Array, width: jax.Array
     ) -> tuple[LocalSoil, jax.Array]:
-        """The soil [W] at ``places`` [W, 2] m, and the slope [] ahead at their middle, rad.
+        """The soil under the wheels, and the slope ahead of the rover.
 
-        ``heading`` [] is the direction in rad, ``width`` that of a wheel in m. A rise ahead is
-        positive.
+        Args:
+            state: the ground of the episode.
+            places: [W, 2], positions of the W wheels, m.
+            heading: [], direction of the rover, rad.
+            width: [], width of a wheel, m.
+
+        Returns:
+            The soil, fields [W], and the slope [] in the middle between the wheels, rad; a rise
+            ahead is positive.
         """
         soils, size = len(FIELDS) - 1, float32(np.sqrt(2.0 / WAVES))
         waves = jnp.asarray(VECTORS, jnp.float32)
@@ -103,14 +112,14 @@ class Ground(Process):
         fields = size * fields
         middle = jnp.mean(places, axis=0) / float32(self.slope_length)
         direction = jnp.stack([jnp.cos(heading), jnp.sin(heading)])
-        # The derivative of cos(2 pi turns): a sine is a cosine a quarter turn back.
+        # The derivative of cos(2 pi turns) is a sine, which is a cosine a quarter turn earlier.
         turns = _along(waves[:, soils], middle) + state.phases[:, soils]
         ahead = -2.0 * jnp.pi * _along(waves[:, soils], direction)
         slope = size * jnp.sum(ahead * cosine_of_turns(turns - 0.25))
         return self._soil(fields, width), jnp.deg2rad(float32(self.slope)) * slope
 
     def _soil(self, fields: jax.Array, width: jax.Array) -> LocalSoil:
-        """The soil [W] of the fields' values [W, FIELDS - 1]."""
+        """The soil [W] for the values [W, FIELDS - 1] of all fields except the height."""
         share = jax.nn.sigmoid(float32(SHARPNESS) * fields[:, FIELDS.index("other")])
         one, two = (local_soil(soil, width) for soil in (self.soil, self.other))
 
@@ -151,18 +160,20 @@ def _along(vectors: jax.Array, place: jax.Array) -> jax.Array:
 
 
 def cosine_of_turns(turns: jax.Array) -> jax.Array:
-    """``cos(2 pi turns)`` within 2e-6: half the turn's cosine by its series, then doubled."""
+    """``cos(2 pi turns)``, within 2e-6, from the series of the cosine of half the angle."""
     half = jnp.pi * (turns - jnp.round(turns))
     cosine = cosine_of(half)
     return 2.0 * cosine * cosine - 1.0
 
 
 def _wave_vectors() -> np.ndarray:
-    """[M, FIELDS, 2] in turns, for a correlation length of 1.
+    """The wave vectors [M, FIELDS, 2], in turns, for a correlation length of 1.
 
-    Pairs of one length and orthogonal directions, so that a field varies alike in every direction.
-    The squares of the lengths are the means of equal parts of their distribution, which is that of
-    -2 ln(1 - u), and the directions of the pairs and the fields turn by the golden angle.
+    Two vectors of equal length and orthogonal directions form a pair, so that a field varies
+    equally in all directions. The squared length has the distribution of -2 ln(1 - u), where u is
+    uniform. This distribution is divided into parts of equal probability, and the mean of each part
+    is the squared length of a pair. The directions of successive pairs differ by the golden angle,
+    and those of successive fields by a tenth of it.
     """
     edges = np.linspace(1.0, 0.0, WAVES // 2 + 1)
     below = np.where(edges > 0.0, edges * np.log(np.maximum(edges, 1e-9)), 0.0)

@@ -1,4 +1,4 @@
-"""The rover on soil by name: grounds, baselines and drawing."""
+"""Registers the rover on soil with its grounds, baselines and drawing."""
 
 import jax
 
@@ -18,12 +18,15 @@ GROUNDS = {
     "mixed": Ground(DRY_SAND, REGOLITH),
     "mixed-slope": Ground(DRY_SAND, REGOLITH, slope=2.0),
 }
-"""Without a slope and with one: standard deviations in degrees that each soil lets a wheel climb
-[choice]."""
+"""Each ground without and with a slope. The standard deviation of the slope, in degrees, is one
+that a wheel can climb on this soil [choice]."""
 
 
 def met_slip(state: RoverSoilState) -> jax.Array:
-    """The wheels' slip [..., 2] before the next command: what becomes of it is the soil's."""
+    """The slip of the wheels [..., 2] at the end of the last step.
+
+    The soil then determines how the slip changes during the next step.
+    """
     return state.slip
 
 
@@ -51,5 +54,5 @@ register(
         hidden_elements=("left", "right"),
     ),
     with_params=RoverSoil,
-    try_disturbances=False,  # the tests do, and an import stays quick
+    try_disturbances=False,  # the tests trace them; the import stays fast
 )

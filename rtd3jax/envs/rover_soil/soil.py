@@ -1,6 +1,6 @@
-"""Soils by their published parameters, and what a wheel meets of one.
+"""Soils with their published parameters, and the properties of the soil under a wheel.
 
-SI units throughout; angles of soils in degrees, as they are published.
+SI units, except that angles of soils are in degrees, as in the publications.
 """
 
 from typing import NamedTuple
@@ -12,16 +12,16 @@ from flax import struct
 from rtd3jax.envs.processes.process import float32, require
 
 REFERENCE_SINKAGE = 0.01
-"""m, where a soil's pressure is stated. Moduli of two exponents have two units, so that they cannot
-be blended; the pressures at one depth can."""
+"""m, the depth at which `LocalSoil` gives the pressure. Moduli with different exponents have
+different units and cannot be interpolated; the pressures at one depth can be interpolated."""
 
 
 class Soil(struct.PyTreeNode):
-    """A soil in the sense of Bekker, Wong and Reece, Janosi and Hanamoto.
+    """A soil in the model of Bekker, Wong and Reece, and Janosi and Hanamoto.
 
-    The pressure below a plate of width b at depth z is ``(k_c / b + k_phi) z^n``, the shear stress
-    after the displacement j ``(c + sigma tan(phi)) (1 - exp(-j / K))``. The normal stress below a
-    driven wheel is greatest at ``(a_0 + a_1 slip)`` of its entry angle.
+    The pressure below a plate of width b at depth z is ``(k_c / b + k_phi) z^n``. After the
+    displacement j, the shear stress is ``(c + sigma tan(phi)) (1 - exp(-j / K))``. The normal
+    stress below a driven wheel is greatest at ``(a_0 + a_1 slip)`` times the entry angle.
     """
 
     cohesion: float
@@ -41,8 +41,8 @@ class Soil(struct.PyTreeNode):
     peak_slope: float
     """a_1"""
     exit_ratio: float
-    """lambda: depth at which the soil leaves the wheel behind, over the sinkage; 0 where it leaves
-    below the axle"""
+    """lambda: height above the lowest point of the wheel at which the contact ends behind the axle,
+    divided by the sinkage; with 0, the contact ends below the axle"""
 
     def validate(self) -> None:
         """Raise UserError for a parameter beyond the range in which the model is used."""
@@ -68,10 +68,10 @@ DRY_SAND = Soil(
     peak_slope=0.32,
     exit_ratio=0.0,
 )
-"""Dry sand of the Land Locomotion Laboratory: k_c, k_phi, n, c and phi from Wong, "Theory of Ground
-Vehicles" (2008), Table 2.3; K, that of loose sand, from the same book (1 cm for firm sand to 2.5 cm
-for loose); a_0 and a_1, those of loose sand, from Wong and Reece, J. Terramechanics 4(1), 1967, who
-let the soil leave below the axle."""
+"""Dry sand of the Land Locomotion Laboratory. k_c, k_phi, n, c and phi are from Wong, "Theory of
+Ground Vehicles" (2008), Table 2.3. K is that of loose sand in the same book, which gives 1 cm for
+firm sand to 2.5 cm for loose sand. a_0 and a_1 are those of loose sand in Wong and Reece, J.
+Terramechanics 4(1), 1967, where the contact ends below the axle."""
 
 REGOLITH = Soil(
     cohesion=800.0,
@@ -84,8 +84,8 @@ REGOLITH = Soil(
     peak_slope=0.15,
     exit_ratio=0.9,
 )
-"""Lunar regolith simulant: Ishigami, Miwa, Nagatani and Yoshida, J. Field Robotics 24(3), 2007; K
-is theirs without a slip angle."""
+"""Lunar regolith simulant from Ishigami, Miwa, Nagatani and Yoshida, J. Field Robotics 24(3), 2007;
+K is the published value for a zero slip angle."""
 
 
 class LocalSoil(NamedTuple):
@@ -113,7 +113,7 @@ class LocalSoil(NamedTuple):
 
 
 def local_soil(soil: Soil, width: float | jax.Array) -> LocalSoil:
-    """``soil`` below a wheel of ``width`` m; [] each."""
+    """``soil`` below a wheel of ``width`` m; every field has shape []."""
     modulus = float32(soil.cohesive_modulus) / float32(width) + float32(soil.frictional_modulus)
     exponent = float32(soil.exponent)
     return LocalSoil(

@@ -2,23 +2,26 @@
 
 The equations are those of Ishigami, Miwa, Nagatani and Yoshida, "Terramechanics-based model for
 steering maneuver of planetary exploration rovers on loose soil", J. Field Robotics 24(3), 2007,
-without a slip angle. SI units; angles in rad, from the vertical below the axle, positive to where
-the wheel is driven. Soil touches the wheel from the entry angle to the exit angle, which is behind:
+without a slip angle. SI units. Angles are in rad, from the vertical below the axle, and positive in
+the driving direction. Soil touches the wheel from the entry angle to the exit angle, which is
+behind the axle:
 
-    normal stress   sigma = (k_c / b + k_phi) r^n (cos(theta) - cos(entry))^n     before the peak,
-                    the same of an angle mapped linearly from exit..peak to entry..peak behind it
+    normal stress   sigma = (k_c / b + k_phi) r^n (cos(theta) - cos(entry))^n     before the peak;
+                    behind it, the same formula for theta mapped linearly from exit..peak to
+                    entry..peak
     displacement    j = r ((entry - theta) - (1 - slip) (sin(entry) - sin(theta)))
     shear stress    tau = (c + sigma tan(phi)) (1 - exp(-j / K))
     vertical force  r b  integral of  tau sin(theta) + sigma cos(theta)
     drawbar pull    r b  integral of  tau cos(theta) - sigma sin(theta)
     torque          r^2 b  integral of  tau
 
-The sinkage ``r (1 - cos(entry))`` is where the vertical force carries the load.
+At the sinkage ``r (1 - cos(entry))``, the vertical force equals the load.
 
-Beyond the source [choice]: a wheel that is braked or turns backwards. ``rolling`` is 1 for a wheel
-that rolls forwards, -1 backwards, and passes through 0 where it stands; the displacement is then
-``r (rolling ((entry - theta) - (sin(entry) - sin(theta))) + slip (sin(entry) - sin(theta)))``,
-whose sign the shear stress has. For rolling = 1 and slip >= 0 that is the source's.
+This module also covers wheels that brake or turn backwards, which the source does not [choice].
+``rolling`` is 1 for a wheel that rolls forwards and -1 for one that rolls backwards, and it passes
+through 0 at rest. The displacement is then
+``r (rolling ((entry - theta) - (sin(entry) - sin(theta))) + slip (sin(entry) - sin(theta)))``, and
+the shear stress has its sign. For rolling = 1 and slip >= 0, this is the formula of the source.
 """
 
 from typing import NamedTuple
@@ -34,7 +37,8 @@ from rtd3jax.envs.rover_soil.soil import REFERENCE_SINKAGE, LocalSoil
 NODES = 6
 """Gauss-Legendre nodes on each side of the peak of the normal stress."""
 SMALLEST_ENTRY, LARGEST_ENTRY = 0.02, 1.5
-"""rad: a wheel that sinks deeper than nearly its radius is beyond the model."""
+"""rad, bounds of the entry angle. At the upper bound, the sinkage is nearly the wheel's radius; the
+model is not valid beyond it."""
 
 
 _Sums = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
@@ -49,7 +53,7 @@ class Wheel(struct.PyTreeNode):
     """m"""
 
     def validate(self) -> None:
-        """Raise UserError for a wheel without extent."""
+        """Raise UserError unless radius and width are positive."""
         require(self, "radius", above=0)
         require(self, "width", above=0)
 
@@ -61,7 +65,8 @@ class Forces(NamedTuple):
         vertical: N, upwards.
         pull: N, drawbar pull, forwards.
         torque: N m, against the motor.
-        torque_slope: N m, derivative of ``torque`` by the slip at this entry angle and peak.
+        torque_slope: N m, derivative of ``torque`` by the slip, for a fixed entry angle and a fixed
+            peak of the normal stress.
     """
 
     vertical: jax.Array
@@ -77,10 +82,10 @@ def contact_forces(
     slip: jax.Array,
     rolling: float | jax.Array = 1.0,
 ) -> Forces:
-    """Integrate the stresses over the contact from the entry angle ``entry``; all of one shape.
+    """The forces on a wheel with the entry angle ``entry``; all arrays have the same shape.
 
-    Both sides of the peak share their nodes' normal stresses, for those behind it are mapped to
-    those before it.
+    The stresses are integrated over the contact. Each node behind the peak is mapped to a node
+    before the peak, so both have the same normal stress, which is computed once.
     """
     dtype = entry.dtype
     radius, width = (jnp.asarray(extent, dtype) for extent in (wheel.radius, wheel.width))
@@ -112,7 +117,7 @@ def contact_forces(
             torque_slope += left * lag * extent
         return (vertical, pull, torque, torque_slope), None
 
-    # A loop over the nodes: written out, they take four times as long to compile and to run.
+    # Without a loop over the nodes, compilation and execution take four times as long.
     nodes = jnp.asarray(np.stack(unit_nodes(NODES), axis=1), dtype)
     zero = jnp.zeros_like(entry)
     sums, _ = jax.lax.scan(add, (zero, zero, zero, zero), nodes)
@@ -127,14 +132,14 @@ def contact_forces(
 
 
 def sine_of(angle: jax.Array) -> jax.Array:
-    """The sine of an angle within a quarter turn, by its series: within 6e-8, and vectorised."""
+    """The sine of an angle in [-pi/2, pi/2], by its series, which XLA vectorises; within 6e-8."""
     square = angle * angle
     series = _horner(square, (1.0, -1 / 6, 1 / 120, -1 / 5040, 1 / 362_880, -1 / 39_916_800))
     return angle * series
 
 
 def cosine_of(angle: jax.Array) -> jax.Array:
-    """The cosine of an angle within a quarter turn, as `sine_of`."""
+    """The cosine of an angle in [-pi/2, pi/2]; see `sine_of`."""
     coefficients = (1.0, -1 / 2, 1 / 24, -1 / 720, 1 / 40_320, -1 / 3_628_800, 1 / 479_001_600)
     return _horner(angle * angle, coefficients)
 
@@ -148,16 +153,18 @@ def _horner(value: jax.Array, coefficients: tuple[float, ...]) -> jax.Array:
 
 
 def exit_angle(soil: LocalSoil, entry: jax.Array) -> jax.Array:
-    """The exit angle, behind the axle: the sinkage there is lambda times the whole sinkage.
+    """The exit angle, behind the axle, where the contact ends.
 
-    ``-arccos(1 - lambda (1 - cos(entry)))``, by half angles: of the sine, which float32 keeps.
+    This point lies lambda times the sinkage above the lowest point of the wheel, so the angle is
+    ``-arccos(1 - lambda (1 - cos(entry)))``. The code uses sines of half angles, because float32
+    rounds ``1 - cos`` of a small angle coarsely.
     """
     sine = jnp.minimum(jnp.sqrt(soil.exit_ratio) * sine_of(0.5 * entry), 1.0)
     return -2.0 * _arcsine(sine)
 
 
 def _arcsine(sine: jax.Array) -> jax.Array:
-    """The arcsine of 0 to 1, within 2e-7 (Abramowitz and Stegun 1964, 4.4.46)."""
+    """The arcsine of a number from 0 to 1, within 2e-7 (Abramowitz and Stegun 1964, 4.4.46)."""
     series = _horner(sine, _ARCSINE)
     return 0.5 * jnp.pi - jnp.sqrt(1.0 - sine) * series
 
@@ -184,10 +191,11 @@ def static_entry_angle(soil: LocalSoil, wheel: Wheel, load: jax.Array) -> jax.Ar
 
 
 def deeper(soil: LocalSoil, entry: jax.Array, vertical: jax.Array, load: jax.Array) -> jax.Array:
-    """The entry angle that carries ``load`` if the force goes with its power 2 n + 1.
+    """The next estimate of the entry angle at which the vertical force equals ``load``, in N.
 
-    That is its power without shear, and nearly so with it: repeated, it converges in few steps from
-    above or below, and needs no derivative.
+    The estimate assumes that the force is proportional to the power 2 n + 1 of the entry angle.
+    This is true without shear, and nearly true with it. So the iteration converges in few steps
+    from above or below, and needs no derivative.
     """
     ratio = load / jnp.maximum(vertical, 1e-3 * load)
     moved = entry * jnp.exp(jnp.log(ratio) / (2.0 * soil.exponent + 1.0))
@@ -200,7 +208,7 @@ def entry_angle(
     load: jax.Array,
     slip: jax.Array,
 ) -> jax.Array:
-    """The entry angle at which the soil carries ``load`` N: the dynamic sinkage."""
+    """The entry angle at which the soil carries ``load`` N at ``slip``: the dynamic sinkage."""
 
     def closer(_: int, entry: jax.Array) -> jax.Array:
         vertical = contact_forces(soil, wheel, entry, slip).vertical

@@ -79,12 +79,12 @@ class Model:
 
     @property
     def width(self) -> int:
-        """H."""
+        """H, the width of every layer."""
         return self.network.head.outputs
 
     @property
     def action_size(self) -> int:
-        """A."""
+        """A, the number of elements of an action."""
         return self.network.output.outputs
 
     @property

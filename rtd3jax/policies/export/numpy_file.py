@@ -10,7 +10,11 @@ _WEIGHTS = 'WEIGHTS = ""\n'
 
 
 def numpy_bytes(model: Model) -> bytes:
-    """The source of a module with a class ``Player``: ``reset()``, ``step(observation)``."""
+    """The source of a module with a class ``Player``: ``reset()``, ``step(observation)``.
+
+    Raises:
+        UserError: when the format does not support the model's memory or encoder.
+    """
     check_portable(model, "numpy")
     shapes = {name: list(array.shape) for name, array in model.arrays.items()}
     raw = b"".join(array.astype("<f4").tobytes() for array in model.arrays.values())

@@ -26,7 +26,8 @@ def onnx_bytes(model: Model) -> bytes:
     Outputs: ``action`` [B, *action_shape] and ``next_...`` for each part.
 
     Raises:
-        UserError: when the package onnx is missing.
+        UserError: when the package onnx is missing, or the format does not support the model's
+            memory or encoder.
     """
     check_portable(model, "onnx")
     try:

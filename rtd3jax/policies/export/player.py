@@ -4,8 +4,8 @@
     player.reset()                       # at the start of every episode
     action = player.step(observation)    # once per control step
 
-`HEADER` describes the policy. The player keeps a carry of the agent's memory for each of the last
-steps, at which the carry started. One product advances all carries, and the last row has read the
+`HEADER` describes the policy. For each of the last steps, the player keeps the carry of the agent's
+memory that started at this step. One product advances all carries, and the last row has read the
 whole window. A policy with a running carry from the start of the episode only has this carry.
 Carries of zeros are the start of an episode.
 """
@@ -23,7 +23,7 @@ class Player:
     """The policy with the state of one episode; use a separate player for each plant.
 
     Args:
-        metadata: the header of the policy; that of this file by default.
+        metadata: the header of the policy; `HEADER` by default.
         weights: the arrays in base64, float32 and little-endian, in the order of the header.
     """
 

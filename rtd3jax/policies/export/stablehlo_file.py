@@ -35,7 +35,7 @@ def stablehlo_bytes(model: Model) -> bytes:
         UserError: when the package flatbuffers is missing.
     """
     _require_flatbuffers()
-    # Outside the traced function, in which the order of constants would not be fixed.
+    # The constants are made here, because their order would not be fixed in the traced function.
     params = jax.tree.map(jnp.asarray, model.params)
     arrays = {name: jnp.asarray(array) for name, array in model.arrays.items()}
     (batch,) = jax.export.symbolic_shape("batch")
@@ -194,7 +194,7 @@ def load_stablehlo(path: str | os.PathLike) -> StableHlo:
     """The policy that ``policy.export(path, format="stablehlo")`` wrote.
 
     Raises:
-        UserError: when the file is missing, damaged, of another kind, or of a newer format; when
+        UserError: when the file is missing, damaged, of another kind, or of another format; when
             the package flatbuffers is missing.
     """
     _require_flatbuffers()

@@ -147,7 +147,8 @@ def _references(
 def curve_data(rows: pd.DataFrame, measure: str, along: str) -> dict[str, Any] | None:
     """IQM over the seeds with the bounds of its interval, at each value of the column ``along``.
 
-    The page calls these values "steps". Of more than `MOST_POINTS`, an evenly spaced part is left.
+    The page calls these values "steps". Of more than `MOST_POINTS` values, this number is kept,
+    evenly spaced. The result is None without a finite value.
     """
     rows = rows[np.isfinite(rows[measure].astype(np.float64))]
     if rows.empty:
@@ -157,7 +158,7 @@ def curve_data(rows: pd.DataFrame, measure: str, along: str) -> dict[str, Any] |
         points = np.unique(np.linspace(0, table.shape[1] - 1, MOST_POINTS).round().astype(int))
         table = table.iloc[:, points]
     count, iqm, low, high = iqm_bands(table.to_numpy(np.float64))
-    number = int if table.columns.dtype.kind in "iu" else rounded_number  # all digits of steps
+    number = int if table.columns.dtype.kind in "iu" else rounded_number  # steps keep all digits
     return {
         "steps": [number(value) for value in table.columns],
         "seeds": [int(seeds) for seeds in count],

@@ -79,7 +79,7 @@ def refresh_page(directory: RunDirectory, *, complete: bool) -> None:
 
 
 def page_data(directory: RunDirectory, *, complete: bool, playback: bool) -> dict[str, Any]:
-    """The data of the page."""
+    """The data of the page, JSON-ready; the arguments are those of `write_page`."""
     notes: list[str] = []
     tables = current_tables(directory, notes)
     lanes = seed_means(tables["episodes"])

@@ -12,10 +12,10 @@ from rtd3jax.study.rundir import RunDirectory
 def robustness_data(
     directory: RunDirectory, policies: Callable[[], set[str]], notes: list[str]
 ) -> list[dict[str, Any]] | None:
-    """Each stress of each cell, with a curve over its values; None without a table.
+    """Each stress of each cell, with a curve over its values; None without rows of these policies.
 
     ``cell`` is an index of the study's cells. A curve is the interquartile mean over the seeds,
-    with the bounds of its interval, as of learning curves. ``policies`` and ``notes`` are those of
+    with the bounds of its interval, as for learning curves. ``policies`` and ``notes`` are those of
     `of_these_policies`.
 
     Raises:

@@ -12,7 +12,7 @@ from rtd3jax.system.parquet import read_parquet
 
 
 def policies_of(directory: RunDirectory) -> set[str]:
-    """The digests of the lanes whose policies can be tested."""
+    """The digests of the files of the lanes whose policies can be tested."""
     lanes = directory.lanes
     return {
         lanes.digest(cell, seed)
@@ -34,9 +34,9 @@ def of_these_policies(
     Args:
         table: the table of a command that tests policies. An earlier version wrote no column
             `LANE`; all of its rows are kept.
-        policies: returns `policies_of` the study, if they are needed.
+        policies: returns `policies_of` the study; called only if the table has the column `LANE`.
         file: the name of the table's file.
-        command: the command that writes it.
+        command: the command that writes the table.
         notes: receives a line about rows of other policies, and one about policies without rows.
     """
     if LANE not in table:
@@ -53,7 +53,7 @@ def of_these_policies(
 
 
 def read_table(path: Path, columns: Sequence[str]) -> pd.DataFrame | None:
-    """The table, which has at least ``columns``; None if there is none.
+    """The table in ``path``, which has at least ``columns``; None if there is no file.
 
     Raises:
         UserError: when the file exists, but is not such a table.

@@ -15,7 +15,7 @@ from rtd3jax.study.transfer import CELL, COLUMNS, FILE
 def transfer_data(
     directory: RunDirectory, policies: Callable[[], set[str]], notes: list[str]
 ) -> list[dict[str, Any]] | None:
-    """A summary over the seeds for each agent, training and test; None without a table.
+    """A summary over the seeds for each agent, training and test; None without such rows.
 
     ``policies`` and ``notes`` are those of `of_these_policies`.
 
