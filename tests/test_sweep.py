@@ -147,7 +147,7 @@ def test_dry_run_prints_the_plan(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(time_estimate, "workers", lambda: [None, None])
     assert sweep.main(["--preset", "rover", "--dry-run", "--out", str(tmp_path / "run")]) == 0
     plan, said = capsys.readouterr()
-    assert "18 cells × 5 seeds = 90 lanes" in plan and "programs to compile: 6" in plan
+    assert "18 cells × 5 seeds = 90 lanes" in plan and "programs to compile: 18" in plan
     # 75 lanes of two minutes and 15 of td3, which has no window, of one: with two workers.
     assert "MiB" in plan and "time: about 82.5 min" in plan and "timing 4 of 4" in said
 
