@@ -415,7 +415,8 @@ class Config:
     @property
     def updates_before_the_actor(self) -> int:
         """Critic updates before the actor is first updated."""
-        return max(0, -(-(self.first_actor_step - self.learning_starts) // self.update_every))
+        first = self.first_learning_step * self.environments
+        return max(0, -(-(self.first_actor_step - first) // self.update_every))
 
     @property
     def capacity(self) -> int:

@@ -67,6 +67,10 @@ def test_the_actor_starts_with_learning_unless_it_is_told_when():
     assert later.updates_before_the_actor == 0
     told = dataclasses.replace(rtd.Config(actor_starts=1_000), learning_starts=500)
     assert told.first_actor_step == 1_000 and told.updates_before_the_actor == 500
+    # With 16 environments, the first update is after step 1,024.
+    fields = dict(learning_starts=1_009, actor_starts=1_024, eval_every=992)
+    many = rtd.Config(environments=16, **fields)
+    assert many.updates_before_the_actor == 0
 
 
 @pytest.mark.parametrize(

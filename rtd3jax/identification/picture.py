@@ -23,6 +23,8 @@ MOST_ROWS = 1_000
 
 def played(process: Process, steps: int, size: int, episodes: int, seed: int) -> np.ndarray:
     """Simulated offsets [episodes, steps, size] of a process, or slips [episodes, steps, 2]."""
+    if getattr(process, "elements", ()):  # the log has a column for each disturbed element only
+        process = process.replace(elements=())
     if isinstance(process, Ar1Slip | SineSlip):
         size = WHEELS  # for a log of any size: all its elements have the same distribution
     ones = jnp.ones((size,), jnp.float32)

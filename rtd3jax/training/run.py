@@ -316,16 +316,26 @@ def check_starts(jobs: Iterable[Job], checkpoints: Checkpoints | None) -> None:
             job.start.check(job.program, job.lane)
 
 
+_IN_MEMORY = "a policy of "
+"""How the name of a start begins that is no path."""
+
+
 def _starts(start: StartLike, seeds: tuple[int, ...]) -> dict[int, Start]:
     """The networks from which each seed starts; empty for new weights."""
     if start is None:
         return {}
     if isinstance(start, Policy):
         digest = hashlib.sha256(b"".join(a.tobytes() for a in start.parameters().values()))
-        name = f"a policy of {start.algorithm} ({digest.hexdigest()[:12]})"
+        name = f"{_IN_MEMORY}{start.algorithm} ({digest.hexdigest()[:12]})"
         return dict.fromkeys(seeds, Start(name, start))
     if isinstance(start, Run):
         return {seed: _starts(start.policy(seed), (seed,))[seed] for seed in seeds}
+    if isinstance(start, str) and start.startswith(_IN_MEMORY):
+        raise UserError(
+            f"the configuration is that of a training that started from {start}, which is in no "
+            "file: pass this policy again as start=..., or train with "
+            'dataclasses.replace(config, start="")'
+        )
     if isinstance(start, str | Path):
         return starts_of_path(start, seeds)
     raise UserError(

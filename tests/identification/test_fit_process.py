@@ -186,12 +186,13 @@ def test_likelihoods_against_slow_sums():
     assert fit.log_likelihood == pytest.approx(total)
 
 
-def test_a_fit_disturbs_the_elements_that_the_recording_disturbs():
+def test_a_fit_disturbs_the_elements_that_the_recording_disturbs(tmp_path):
     steps = np.random.default_rng(0).normal(size=400)
     log = 0.3 * np.convolve(steps, 0.9 ** np.arange(40), "same")
     recorded = rtd.Recorded(log, elements=(1,))
     fit = rtd.fit_process(recorded, "ornstein-uhlenbeck")
     assert fit.process.elements == (1,) and fit.notes == ()
+    fit.plot(tmp_path / "fit.png")  # of the one column, which belongs to element 1
     (note,) = rtd.fit_process(recorded, "noise").notes[-1:]
     assert note == "The recording disturbs the elements [1], but GaussianNoise disturbs all."
     assert rtd.fit_process(log, "ornstein-uhlenbeck").process.elements == ()

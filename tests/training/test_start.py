@@ -142,10 +142,10 @@ def test_each_seed_goes_on_from_its_own_and_with_others_the_same(env, kept):
     fresh = rtd.train(other, _config(), [1], progress=False)
     assert not _same(fresh.policy(1), alone.policy(1))
     # A Run has the policies alone; its name is part of what checkpoints are of.
-    assert (
-        "a policy of td3"
-        in rtd.train(other, _config(), [0, 1], progress=False, start=run).config.start
-    )
+    begun = rtd.train(other, _config(), [0, 1], progress=False, start=run)
+    assert begun.config.start.startswith("a policy of td3")
+    with pytest.raises(rtd.UserError, match="pass this policy again as start="):
+        rtd.train(other, begun.config, [0, 1], progress=False)
 
 
 @pytest.mark.parametrize(

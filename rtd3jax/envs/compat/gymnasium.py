@@ -147,7 +147,8 @@ class _Forked(GymnasiumEnv):
     def __init__(self, key: Any, render_mode: str | None) -> None:
         if key not in _seen:
             _check_process()
-        self.render_mode, self.environment, self._state = render_mode, None, None
+        self.render_mode, self.environment = render_mode, None
+        self._state = self._episode = None
         self.action_space, self.observation_space = _seen[key]
 
 

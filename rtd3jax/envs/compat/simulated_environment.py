@@ -192,7 +192,7 @@ class FromGymnasium(ValueIdentity, environment.Environment):
         try:
             found, simulator = self.fleet.at(int(handle), place, self._commands(past))
             if simulator is None:
-                raise Fault(_other(self.name, place[1]), found)
+                raise Fault(self.fleet.failed(found, _other(self.name, place[1])), found)
             with faults_of(found):
                 if place[1] >= self._surface.limit:
                     raise simulator.failed(self._too_long("its episode goes on"))
@@ -233,6 +233,9 @@ class FromGymnasium(ValueIdentity, environment.Environment):
             rows = range(state.handle.shape[0])
             parts = [self.restored(jax.tree.map(lambda leaf, k=k: leaf[k], state)) for k in rows]
             if any(part is None for part in parts):
+                for part in parts:
+                    if part is not None:  # no state will name this simulator
+                        self.fleet.release(int(part.handle))
                 return None
             return jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts)
         place = _place(state.seed, state.time, state.digest)
@@ -244,7 +247,7 @@ class FromGymnasium(ValueIdentity, environment.Environment):
             return state.replace(handle=jnp.int32(fault.args[1]))
         if simulator is None:
             self.fleet.release(found)
-            say(_other(self.name, place[1]))
+            say(f"{_other(self.name, place[1])}; a fresh one begins")
             return None
         return state.replace(handle=jnp.int32(found))
 
@@ -256,10 +259,7 @@ def _place(seed: _Whole, time: _Whole, digest: ArrayLike) -> tuple[int, int, tup
 
 
 def _other(name: str, steps: int) -> str:
-    return (
-        f"{name} is not deterministic: its episode, replayed for {steps} steps, was another; "
-        "a fresh one begins"
-    )
+    return f"{name} is not deterministic: its episode, replayed for {steps} steps, was another"
 
 
 _told: set[tuple[str, int]] = set()

@@ -266,6 +266,11 @@ class Fleet:
                 simulator.step(action)
         return handle, simulator if simulator.place == place else None
 
+    def failed(self, handle: int, message: str) -> str:
+        """Record a fault of the simulator of ``handle``, and return its text."""
+        with self._lock:
+            return str(self._busy[handle].failed(message))
+
     def release(self, handle: int) -> None:
         """Make the simulator free for another episode, unless it has failed."""
         with self._lock:

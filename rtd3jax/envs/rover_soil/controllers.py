@@ -52,12 +52,14 @@ class AdaptivePolicy:
 
     The measured slip is ``1 - hub / rim``, from the observed motion and the last commanded rim
     speeds. The estimate is a moving average of the measurements, with weight ``gain``. The next
-    command is the target's wheel speeds divided by ``1 - estimate``.
+    command is the target's wheel speeds divided by ``1 - estimate``, within the rover's limits.
     """
 
     wheelbase: jax.Array
     target_speed: jax.Array
     target_yaw_rate: jax.Array
+    max_speed: jax.Array
+    max_yaw_rate: jax.Array
     gain: jax.Array
 
     def init(self, key: jax.Array | None = None) -> AdaptiveState:
@@ -80,9 +82,14 @@ class AdaptivePolicy:
         slip = jnp.where(known, state.slip + self.gain * (read - state.slip), state.slip)
         slip = jnp.clip(slip, 0.0, LARGEST_SLIP)
         wanted = sides(self.target_speed, self.target_yaw_rate, self.wheelbase)
-        command = wanted / (1.0 - slip)
-        speed = 0.5 * (command[0] + command[1])
-        action = jnp.stack([speed, (command[1] - command[0]) / self.wheelbase])
+        left, right = wanted / (1.0 - slip)
+        speed = jnp.clip(0.5 * (left + right), -self.max_speed, self.max_speed)
+        yaw_rate = (right - left) / self.wheelbase
+        yaw_rate = jnp.clip(yaw_rate, -self.max_yaw_rate, self.max_yaw_rate)
+        # The slip is measured against the command that the rover follows: against a larger one, the
+        # estimate would only grow.
+        command = sides(speed, yaw_rate, self.wheelbase)
+        action = jnp.stack([speed, yaw_rate])
         return action, AdaptiveState(command, slip, state.time + jnp.int32(1))
 
 
@@ -95,5 +102,7 @@ def adaptive_slip(env: EnvironmentLike, gain: float = ESTIMATE_GAIN) -> Adaptive
         wheelbase=float32(params.wheelbase),
         target_speed=float32(params.target_speed),
         target_yaw_rate=float32(params.target_yaw_rate),
+        max_speed=float32(params.max_speed),
+        max_yaw_rate=float32(params.max_yaw_rate),
         gain=float32(gain),
     )

@@ -133,6 +133,10 @@ class RoverSoil(DrivingTask):
         """The parameters given at construction; without them, a rover on even dry sand."""
         return RoverSoilParams() if self._default_params is None else self._default_params
 
+    def check_params(self, params: RoverSoilParams) -> None:
+        """Raise UserError as `check_ground` does, for parameters given later."""
+        check_ground(params)
+
     def reset_env(
         self, key: jax.Array, params: RoverSoilParams
     ) -> tuple[jax.Array, RoverSoilState]:

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 import rtd3jax as rtd
-from rtd3jax.envs.compat.simulator import Fault, Simulator, close_simulators
+from rtd3jax.envs.compat.simulator import Fault, Simulator, close_simulators, fault_of
+from rtd3jax.envs.compat.simulator_state import simulator_handles
 from rtd3jax.envs.compat.surface import surface_of
 
 SMALL = rtd.Config(
@@ -236,6 +237,13 @@ def test_resumed_lanes_end_with_the_same_bits(tmp_path, noise):
     assert int(fresh.episode_step[0]) == 0 and int(fresh.env_state.time) == 0
     done = advance(lane, fresh, jnp.int32(33), jnp.int32(60))
     assert int(done.failure) == 0
+    # A lane whose simulator is lost while it is trained names the reason.
+    state = advance(lane, jax.jit(program.init)(lane), jnp.int32(0), jnp.int32(33))
+    close_simulators()
+    with pytest.warns(UserWarning, match="not deterministic"):
+        lost = jax.block_until_ready(advance(lane, state, jnp.int32(33), jnp.int32(60)))
+    assert int(lost.failure) != 0
+    assert "not deterministic" in fault_of(int(simulator_handles(lost.env_state)[0]))
 
 
 class Discrete(Cart):

@@ -341,6 +341,9 @@ def test_a_forked_process_is_told_to_spawn(monkeypatch):
         with pytest.raises(UserError, match='context="spawn"') as caught:
             forked.reset(seed=0)
         assert "\n" not in str(caught.value)
+    drawn = rtd.to_gymnasium(environment, render_mode="rgb_array")
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        drawn.render()
     for call in (lambda: env.step(env.action_space.sample()), lambda: named.reset(seed=0)):
         with pytest.raises(UserError, match="forked"):
             call()

@@ -284,6 +284,29 @@ def test_the_adaptive_controller_finds_a_constant_slip():
     np.testing.assert_allclose(state.slip, [0.2, 1 / 3], atol=1e-4)
 
 
+def test_the_adaptive_controller_forgets_a_slip_beyond_its_limits():
+    """At the limit of the speed, it measures against what the rover drives and not what it wants.
+
+    With a slip of 0.6, a speed of 0.5 m/s would need 1.25 m/s, and 1 m/s are allowed.
+    """
+    policy = adaptive_slip(make("rover-soil", "dry-sand"))
+    state, observation = policy.init(), jnp.array([-0.5, 0.0], jnp.float32)
+    step = jax.jit(policy.step)
+    for _ in range(60):
+        action, state = step(state, observation)
+        hub = 0.4 * jnp.clip(action[0], -1.0, 1.0)
+        observation = jnp.stack([hub - 0.5, jnp.float32(0.0)])
+    np.testing.assert_allclose(action, [1.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(state.slip, 0.6, atol=1e-4)
+
+
+def test_parameters_that_are_given_later_are_checked_too():
+    env = make("rover-soil", "dry-sand")
+    heavy = env.default_params.replace(mass=5000.0)
+    with pytest.raises(UserError, match="sinks deeper than its radius"):
+        rtd.evaluate(rtd.constant_policy([0.5, 0.0]), env, 1, params=heavy)
+
+
 def test_controllers_have_nothing_to_say_where_an_error_is_hidden():
     env = rtd.disturb(make("rover-soil", "dry-sand"), rtd.Hidden(element=1))
     baselines = description_of(env, "rover-soil").baselines
