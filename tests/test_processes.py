@@ -246,11 +246,11 @@ class Member:
     """A process that only takes orders."""
 
     def __init__(self, ready=True):
-        self.cores, self.lanes, self.program, self.ready = (0,), [], None, ready
+        self.cores, self.lanes, self.executable, self.ready = (0,), [], None, ready
         self.orders = []
 
     def order(self, lanes, names):
-        self.lanes, self.program = list(lanes), lanes[0].jobs[0].program
+        self.lanes, self.executable = list(lanes), lanes[0].jobs[0].executable
         self.orders.append(names)
 
     def wait(self, seconds):
