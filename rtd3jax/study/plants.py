@@ -24,6 +24,9 @@ Plants = dict[str, dict[str, Any]]
 CODE = "code"
 """The part of an identity that identifies what the code of the environment computes."""
 
+NAMES = "names"
+"""The part of an identity that names its numbers, for messages."""
+
 
 def plants_of(cells: Iterable[Cell]) -> Plants:
     """The plants of these cells, as their code makes them now."""
@@ -52,13 +55,14 @@ def check_plants(path: Path, before: Plants, now: Plants) -> list[str]:
     lines = []
     for name, plant in now.items():
         there = before.get(name, {})
-        here = {part: plant[part] for part in plant if part in there and part != CODE}
+        compared = plant.keys() & there.keys() - {CODE, NAMES}
+        here = {part: plant[part] for part in plant if part in compared}
         was = {part: there[part] for part in here}
         if not same(was, here):
             raise UserError(
                 f"{path} holds lanes of another plant with the name {name} "
-                f"({difference(was, here)}): choose another directory, or register the "
-                "changed plant under another name"
+                f"({_named_difference(was, here, plant[NAMES])}): choose another directory, or "
+                "register the changed plant under another name"
             )
         if _is_other_code(there.get(CODE), plant[CODE]):
             lines.append(
@@ -77,8 +81,25 @@ def _made(cell: Cell) -> dict[str, Any]:
         **plant_of(env, params),
         "observation": interface.observation_size,
         "actions": [interface.action_low.tolist(), interface.action_high.tolist()],
+        NAMES: _names(params),
         CODE: _code_of(env, params),
     }
+
+
+def _names(params: object) -> list[str]:
+    """The names of the numbers of an environment's parameters, such as ``env.mass``."""
+    paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(params)]
+    return [jax.tree_util.keystr(path).lstrip(".") for path in paths]
+
+
+def _named_difference(was: dict[str, Any], here: dict[str, Any], names: list[str]) -> str:
+    """The first difference of two plants in words, with the name of a parameter."""
+    before, now = was.get("params", []), here.get("params", [])
+    if len(before) == len(now) == len(names):
+        for name, one, other in zip(names, before, now, strict=True):
+            if not same(one, other):
+                return f"{name}: {difference(one, other)}"
+    return difference(was, here)
 
 
 def _is_other_code(before: dict[str, str] | None, now: dict[str, str] | None) -> bool:

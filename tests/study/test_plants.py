@@ -61,7 +61,8 @@ def test_a_changed_plant_of_the_same_name_is_refused_with_the_difference(tmp_pat
     study(tmp_path, 0.08)
     study(tmp_path, 0.08)  # the same plant, from another object
     with pytest.raises(
-        rtd.UserError, match=r"another plant .* tank-of-a-study none \(params: \[0.08"
+        rtd.UserError,
+        match=r"another plant .* tank-of-a-study none \(env.drain: 0.08 there, 0.02 here\)",
     ):
         study(tmp_path, 0.02)
 
