@@ -25,7 +25,7 @@ from rtd3jax.study.presets import ROVER_HISTORY_LENGTH, ROVER_SETTINGS, ROVER_ST
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from continuing import joined, kept, not_in, train_missing  # noqa: E402
 from effects import ROVER_MARGIN, Effect  # noqa: E402
-from rover import EPISODES, SEEDS, TINY, in_the_agents_episodes, levels  # noqa: E402
+from rover import EPISODES, SEEDS, TINY, ceiling_returns, levels  # noqa: E402
 from rover_lengths import COLUMNS, KEY, TESTED_ON, has, of_the_rover, tested  # noqa: E402
 from writing import (  # noqa: E402
     RESULTS,
@@ -96,8 +96,7 @@ def main(arguments: list[str] | None = None) -> int:
     has_table = (options.out / "rover.parquet").exists()
     before = of_the_rover(options.out if has_table else RESULTS)
     before = before[before["trained_on"] == TESTED_ON]
-    env = rtd.make("rover", TESTED_ON)
-    best = in_the_agents_episodes(rtd.bayes_policy(env), env, episodes).mean()
+    best = ceiling_returns(TESTED_ON, episodes).mean()
     text = f"{table(now, before, best)}\n\n{levels(episodes, TESTED_ON)}"
     facts = provenance(
         **settings,
