@@ -15,9 +15,9 @@ CONFIDENCE, EQUIVALENCE = 0.95, 0.90
 """Confidence of intervals, and of those that must lie within the margin. Two one-sided tests at 5%
 each reject a difference beyond the margin exactly if the 90% interval lies within it (Schuirmann,
 1987)."""
-SEEDS_OF_LOOKS = (5, 15)
-"""The most seeds of a cell at the first test of a comparison, and at the second test. A cell with
-more seeds shows that the comparison was tested once more."""
+FIRST_SEEDS, SECOND_SEEDS = 5, 15
+"""The most seeds of a cell at the first test of a comparison, and at the second test. Each cell
+with more than ``SECOND_SEEDS`` got them after a further test."""
 SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "undecided"
 NO_EFFECT = "no effect"
 
@@ -56,7 +56,7 @@ class Effect:
     With ``paired``, the sides have the same cells, each with the same seeds in the same order. The
     difference is multiplied by ``factor``. ``parts`` are effects of which this one is the mean.
 
-    A cell got more seeds if a comparison was undecided, so the comparison was tested again. Each of
+    Cells got more seeds if a comparison was undecided, so the comparison was tested again. Each of
     its tests has an equal share of the error (Bonferroni): with 15 seeds in a cell, the intervals
     have a confidence of 97.5% instead of 95%.
     """
@@ -70,10 +70,15 @@ class Effect:
     parts: tuple["Effect", ...] = ()
 
     def looks(self) -> int:
-        """How often the comparison was tested; this follows from the most seeds of a cell."""
+        """How often the comparison was tested at most, which follows from the seeds of its cells.
+
+        Cells got their second seeds together, and their third seeds one cell after the other.
+        """
         sides = (self.better, self.worse)
-        most = max(len(cell) for side in sides for _, cell in cells_of(side))
-        return 1 + sum(most > seeds for seeds in SEEDS_OF_LOOKS)
+        # A cell may occur at several window lengths.
+        cells = {id(cell): cell for side in sides for _, cell in cells_of(side)}.values()
+        second = any(len(cell) > FIRST_SEEDS for cell in cells)
+        return 1 + second + sum(len(cell) > SECOND_SEEDS for cell in cells)
 
     def seeds(self) -> tuple[int, int]:
         """The fewest seeds of a cell, of each side."""
@@ -129,7 +134,8 @@ class Effect:
             return f"{self.name}: too few seeds ({better}, {worse})"
         mean, low, high = self.interval()
         none = f", no effect beyond ±{self.bound():.3f}" if low <= 0 <= high else ""
-        tested = {1: "", 2: " (tested twice)"}.get(self.looks(), " (tested three times)")
+        looks = self.looks()
+        tested = {1: "", 2: " (tested twice)"}.get(looks, f" (tested {looks} times)")
         return f"{self.name}: {mean:+.3f} [{low:+.3f}, {high:+.3f}]{none}{tested}"
 
 

@@ -274,8 +274,11 @@ def test_intervals_are_wider_if_a_comparison_was_tested_again():
         test = stats.ttest_ind(better, worse, equal_var=False)
         expected = test.confidence_interval(1 - 0.05 / looks)
         assert effects.Effect("", better, worse).interval()[1:] == pytest.approx(expected)
-        said = {1: "", 2: "twice", 3: "three times"}[looks]
+        said = {1: "", 2: "twice", 3: "3 times"}[looks]
         assert said in effect.text() and ("tested" in effect.text()) == (looks > 1)
+    # Two cells got 40 seeds one after the other; a cell that occurs twice counts once.
+    both = effects.Effect("", [better, better], [chance.normal(0, 1, 40), worse])
+    assert both.looks() == 4
 
 
 def test_comparisons_have_a_part_for_each_length():
