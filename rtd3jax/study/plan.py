@@ -249,7 +249,7 @@ def plan_text(
     lines += [
         f"programs to compile: {cost.programs}",
         f"memory of the largest lane: {cost.state_bytes / 2**20:,.1f} MiB of state "
-        "(parameters, optimisers, replay, carries), and "
+        "(parameters, optimisers, replay, carries, recordings), and "
         f"{cost.working_bytes / 2**20:,.1f} MiB while it advances (activations, gradients)",
         f"lanes that fit in {memory / 2**30:,.1f} GiB"
         f"{' of a device' if strategy == 'vmap' else ''}: {min(fit, len(jobs)):,}{waits}",

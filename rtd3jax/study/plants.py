@@ -1,20 +1,15 @@
 """The plants of a study: the same name must mean the same plant as long as the study grows."""
 
-import hashlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
-import jaxlib
 
-from rtd3jax.envs.compat.simulated import is_simulated
-from rtd3jax.envs.interface import describe, foreign_code
+from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
-from rtd3jax.protocols import EnvironmentLike
 from rtd3jax.study.plan import Cell
-from rtd3jax.system.jax_settings import random_key, with_settings
+from rtd3jax.study.plant_code import code_of, is_other_code
 from rtd3jax.training.checkpoint import difference, same
 from rtd3jax.training.plant import plant_of
 
@@ -30,8 +25,8 @@ NAMES = "names"
 
 def plants_of(cells: Iterable[Cell]) -> Plants:
     """The plants of these cells, as their code makes them now."""
-    first = {plant_name(cell): cell for cell in cells}
-    return {name: _made(cell) for name, cell in first.items()}
+    by_name = {plant_name(cell): cell for cell in cells}
+    return {name: _made(cell) for name, cell in by_name.items()}
 
 
 def plant_name(cell: Cell) -> str:
@@ -56,21 +51,46 @@ def check_plants(path: Path, before: Plants, now: Plants) -> list[str]:
     for name, plant in now.items():
         there = before.get(name, {})
         compared = plant.keys() & there.keys() - {CODE, NAMES}
-        here = {part: plant[part] for part in plant if part in compared}
-        was = {part: there[part] for part in here}
-        if not same(was, here):
+        if any(not same(there[part], plant[part]) for part in compared):
+            changed = _difference(there, plant, compared)
             raise UserError(
-                f"{path} holds lanes of another plant with the name {name} "
-                f"({_named_difference(was, here, plant[NAMES])}): choose another directory, or "
-                "register the changed plant under another name"
+                f"{path} holds lanes of another plant with the name {name} ({changed}): register "
+                "the changed plant under another name, or use another run directory"
             )
-        if _is_other_code(there.get(CODE), plant[CODE]):
+        if is_other_code(there.get(CODE), plant[CODE]):
             lines.append(
                 f"warning: the code of {name} computes something else now than when {path} was "
-                "begun, so one table can show results of two plants: choose another directory "
-                "unless the change does not matter"
+                "begun, so results of two plants would stand side by side: use another run "
+                "directory unless the change does not matter"
             )
     return lines
+
+
+class CheckedEnvironments:
+    """Makes the environments of a study's cells; each plant is compared with the study once.
+
+    Args:
+        check: `rtd3jax.study.rundir.RunDirectory.check_plants`.
+        say: receives a line for each plant whose code has changed.
+    """
+
+    def __init__(self, check: Callable[[Plants], list[str]], say: Callable[[str], None]) -> None:
+        self._check, self._say = check, say
+        self._found: dict[str, Any] = {}
+
+    def of(self, cell: Cell) -> Any:
+        """The environment of a cell; UserError if its plant is another one, or cannot be made."""
+        name = plant_name(cell)
+        if name not in self._found:
+            try:
+                for line in self._check(plants_of([cell])):
+                    self._say(line)
+                self._found[name] = cell.make_env()
+            except UserError as error:
+                self._found[name] = error
+        if isinstance(self._found[name], UserError):
+            raise UserError(str(self._found[name]))
+        return self._found[name]
 
 
 def _made(cell: Cell) -> dict[str, Any]:
@@ -82,7 +102,7 @@ def _made(cell: Cell) -> dict[str, Any]:
         "observation": interface.observation_size,
         "actions": [interface.action_low.tolist(), interface.action_high.tolist()],
         NAMES: _names(params),
-        CODE: _code_of(env, params),
+        CODE: code_of(env, params),
     }
 
 
@@ -92,44 +112,22 @@ def _names(params: object) -> list[str]:
     return [jax.tree_util.keystr(path).lstrip(".") for path in paths]
 
 
-def _named_difference(was: dict[str, Any], here: dict[str, Any], names: list[str]) -> str:
-    """The first difference of two plants in words, with the name of a parameter."""
-    before, now = was.get("params", []), here.get("params", [])
-    if len(before) == len(now) == len(names):
-        for name, one, other in zip(names, before, now, strict=True):
-            if not same(one, other):
-                return f"{name}: {difference(one, other)}"
-    return difference(was, here)
+def _difference(before: dict[str, Any], now: dict[str, Any], parts: Iterable[str]) -> str:
+    """The first difference of two plants in words, with the name of a parameter.
 
-
-def _is_other_code(before: dict[str, str] | None, now: dict[str, str] | None) -> bool:
-    """Whether two codes differ; another version of JAX may write the same code differently."""
-    if before is None or now is None or before["jax"] != now["jax"]:
-        return False
-    return before["sha256"] != now["sha256"]
-
-
-def _code_of(env: EnvironmentLike, params: object) -> dict[str, str] | None:
-    """A digest of the operations of reset and step, without the numbers of the parameters.
-
-    Nothing is compiled. The result is None for an environment that calls Python while it runs: the
-    digest would not cover this Python code, and would differ in every process.
+    A study of an earlier version does not state the names.
     """
-    if is_simulated(env):
-        return None
+    if not same(before["params"], now["params"]):
+        names = before.get(NAMES, now[NAMES]), now[NAMES]
+        if all(map(_has_names, names, (before, now))):
+            one, other = (
+                dict(zip(own, plant["params"], strict=True))
+                for own, plant in zip(names, (before, now), strict=True)
+            )
+            return difference(one, other)
+    ordered = [part for part in now if part in parts]
+    return difference({p: before[p] for p in ordered}, {p: now[p] for p in ordered})
 
-    def both(key: jax.Array, state: object, action: jax.Array, params: object) -> tuple:
-        return env.reset(key, params), env.step(key, state, action, params)
 
-    shape = env.action_space(params).shape
-    # The text must not depend on the settings of the process, nor on its devices.
-    with with_settings(()), foreign_code(), jax.disable_jit(False):
-        key = random_key(0)
-        state = jax.eval_shape(env.reset, key, params)[1]
-        action = jax.ShapeDtypeStruct(shape, jnp.float32)
-        traced = jax.jit(both).trace(key, state, action, params)
-        text = traced.lower(lowering_platforms=("cpu",)).as_text()
-    if "callback" in text:
-        return None
-    versions = f"{jax.__version__}, jaxlib {jaxlib.__version__}"
-    return {"jax": versions, "sha256": hashlib.sha256(text.encode()).hexdigest()}
+def _has_names(names: list[str], plant: dict[str, Any]) -> bool:
+    return len(names) == len(plant["params"])

@@ -15,7 +15,7 @@ from rtd3jax.evaluation.robustness_plot import plot_robustness
 from rtd3jax.study.colours import ordered
 from rtd3jax.study.lane_files import file_name
 from rtd3jax.study.plan import Cell
-from rtd3jax.study.plants import plants_of
+from rtd3jax.study.plants import CheckedEnvironments
 from rtd3jax.study.results import CELL, LANE
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.system.files import check_writable, write_bytes_atomically
@@ -47,7 +47,7 @@ def run_robustness(
 
     Raises:
         UserError: for an unknown stress or an impossible value, when nothing is trained yet, when
-            a plant is not the one of the study, or when the table could not be written.
+            no plant is the one of the study, or when the table could not be written.
     """
     check_counts(episodes, 0)
     check_writable(directory.path)
@@ -61,9 +61,7 @@ def run_robustness(
         raise UserError(
             f"{directory.path} has no finished lane that could be tested: --status prints the lanes"
         )
-    for line in directory.check_plants(plants_of(cell for cell, _ in lanes)):
-        say(line)
-    cases = _all_cases([cell for cell, _ in lanes], stresses, say)
+    cases = _all_cases(directory, [cell for cell, _ in lanes], stresses, say)
     rows: list[dict[str, Any]] = []
     for cell, seed in lanes:
         own = cases.get((cell.env, cell.disturbance))
@@ -117,18 +115,22 @@ def over_seeds(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _all_cases(
-    cells: Sequence[Cell], stresses: Sequence[str] | None, say: Callable[[str], None]
+    directory: RunDirectory,
+    cells: Sequence[Cell],
+    stresses: Sequence[str] | None,
+    say: Callable[[str], None],
 ) -> dict[tuple[str, str], list[Case]]:
     """The cases of each environment and disturbance.
 
     If one of the stresses does not fit an environment, this environment has no cases, and ``say``
     receives a line. UserError if no environment has cases.
     """
+    environments = CheckedEnvironments(directory.check_plants, say)
     cases: dict[tuple[str, str], list[Case]] = {}
     problems: list[UserError] = []
     for key, cell in {(cell.env, cell.disturbance): cell for cell in cells}.items():
         try:
-            cases[key] = make_cases(cell.make_env(), stresses, env_id=cell.env)
+            cases[key] = make_cases(environments.of(cell), stresses, env_id=cell.env)
         except UserError as error:
             problems.append(error)
             say(f"not tested on {cell.env} with {cell.disturbance}: {error}")

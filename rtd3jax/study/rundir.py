@@ -27,7 +27,7 @@ from rtd3jax.study.contents import (
 from rtd3jax.study.lane_files import LaneFiles, cell_name, check_names
 from rtd3jax.study.lock import writer
 from rtd3jax.study.plan import Cell
-from rtd3jax.study.plants import Plants, check_plants, plants_of
+from rtd3jax.study.plants import Plants, check_plants, plant_name, plants_of
 from rtd3jax.system.files import (
     user_path,
     write_bytes_atomically,
@@ -56,7 +56,7 @@ class RunDirectory:
     ):
         self.path = user_path(path)
         self.lanes = LaneFiles(self.path)
-        self._made: Plants | None = None
+        self._made: Plants = {}
         self._asked = self.contents = Contents(tuple(cells), tuple(seeds), episodes)
 
     @classmethod
@@ -125,7 +125,7 @@ class RunDirectory:
                 f"--out {self.path} holds another study ({error}); "
                 "choose another directory, or remove that one"
             ) from error
-        news = self.check_plants(self._plants())
+        news = self.check_plants(self._plants(self.contents.cells))
         self._check_longer(there)
         self._check_format(config)
         if self.contents != there:
@@ -182,7 +182,7 @@ class RunDirectory:
         config, news = self.path / CONFIG, self.plan()
         if not config.exists():
             study = self.contents.to_dict()
-            made_with, plants = _made_with(), self._plants()
+            made_with, plants = _made_with(), self._plants(self.contents.cells)
             new = {
                 "format": CONFIG_FORMAT,
                 "study": study,
@@ -198,15 +198,27 @@ class RunDirectory:
                 {"added": added, "made_with": _made_with()},
             ]
             content["study"] = self.contents.to_dict()
-            content["plants"] = {**self._plants(), **content.get("plants", {})}
+            plants = self._plants(self._asked.cells)
+            content["plants"] = {**plants, **content.get("plants", {})}
             _write_config(config, content)
         return news
 
-    def _plants(self) -> Plants:
-        """The plants that this sweep names; their environments are made once."""
-        if self._made is None:
-            self._made = plants_of(self._asked.cells)
-        return self._made
+    def _plants(self, cells: Sequence[Cell]) -> Plants:
+        """The plants of these cells; their environments are made once.
+
+        A cell that this sweep does not name may be of an environment that it does not know. That is
+        an error when the cell is trained, but not when the study is only read.
+        """
+        for cell in cells:
+            if plant_name(cell) in self._made:
+                continue
+            try:
+                self._made |= plants_of([cell])
+            except UserError:
+                if cell in self._asked.cells:
+                    raise
+        names = map(plant_name, cells)
+        return {name: self._made[name] for name in names if name in self._made}
 
     def refresh(self) -> bool:
         """Read additions of another process; return whether there are any."""

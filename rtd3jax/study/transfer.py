@@ -10,7 +10,7 @@ import pandas as pd
 from rtd3jax.errors import UserError
 from rtd3jax.evaluation.returns import both_returns
 from rtd3jax.study.plan import Cell
-from rtd3jax.study.plants import plants_of
+from rtd3jax.study.plants import CheckedEnvironments
 from rtd3jax.study.results import LANE
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.system.files import check_writable, write_bytes_atomically
@@ -54,7 +54,7 @@ def transfer(
     if write:
         check_writable(directory.path)
     rows: list[dict[str, Any]] = []
-    environments: dict[tuple[str, str], Any] = {}
+    environments, any_made = CheckedEnvironments(directory.check_plants, say), False
     problems: dict[tuple[str, str, str], int] = {}
     # The file of a policy is read once for all disturbances.
     policy_of = functools.lru_cache(maxsize=len(directory.seeds))(directory.lanes.policy)
@@ -62,19 +62,14 @@ def transfer(
     for cell in directory.cells if cells is None else cells:
         own = list(dict.fromkeys(c.disturbance for c in directory.cells if c.env == cell.env))
         for disturbance in own if tested_on is None else tested_on:
-            environment = cell.env, disturbance
             for seed in directory.seeds:
                 try:
-                    if environment not in environments:
-                        world = Cell(cell.env, disturbance, cell.config)
-                        for line in directory.check_plants(plants_of([world])):
-                            say(line)
-                        environments[environment] = world.make_env()
+                    environments.of(cell)  # the agents must have been trained on this plant
+                    env = environments.of(Cell(cell.env, disturbance, cell.config))
+                    any_made = True
                     if not directory.lanes.is_done(cell, seed):
                         continue
-                    both = both_returns(
-                        policy_of(cell, seed), environments[environment], episodes, seed
-                    )
+                    both = both_returns(policy_of(cell, seed), env, episodes, seed)
                 except UserError as error:
                     problem = cell.disturbance, disturbance, str(error)
                     problems[problem] = problems.get(problem, 0) + 1
@@ -98,7 +93,7 @@ def transfer(
                 ]
     for (trained_on, tested, reason), agents in problems.items():
         say(f"not tested on {tested}: {agents} agents trained on {trained_on}: {reason}")
-    if problems and not environments:  # no environment has such a disturbance
+    if problems and not any_made:  # no environment has such a disturbance
         raise UserError(next(iter(problems))[2])
     if not rows:
         raise UserError(f"no policy in {directory.path} could be tested: --status prints the lanes")

@@ -171,12 +171,12 @@ def make_groups(
     most = at_once or len(jobs)
     if strategy == "map":
         return [Group([job], wave=index // most) for index, job in enumerate(jobs)]
-    by_program: dict[Any, list[Job]] = {}
+    by_executable: dict[Any, list[Job]] = {}
     for job in jobs:
-        by_program.setdefault(job.executable, []).append(job)
+        by_executable.setdefault(job.executable, []).append(job)
     steps_of = checkpoints.steps if checkpoints is not None else lambda job: set()
     shares = []
-    for members in by_program.values():
+    for members in by_executable.values():
         parts = with_common_steps(members, list(map(steps_of, members)))
         width = -(-len(members) // devices)
         for part in parts:
@@ -420,7 +420,8 @@ def _chunk(group: Group, device: jax.Device, rates: dict[Any, float]) -> None:
     init, advance = compiled(program, lane, width > 1, device)
     state = _with_start(group, init(lane), device) if group.state is None else group.state
     state = jax.device_put(state, device)
-    rate = rates.get((program, width))
+    executable = group.jobs[0].executable
+    rate = rates.get((executable, width))
     steps = _FIRST_CHUNK if rate is None else max(1, int(rate * CHUNK_SECONDS))
     # Steps before learning starts are fast: a chunk across this step would take far too long.
     warm_up = program.config.learning_starts
@@ -434,7 +435,7 @@ def _chunk(group: Group, device: jax.Device, rates: dict[Any, float]) -> None:
     jax.block_until_ready(state)
     seconds = time.perf_counter() - began
     if group.step >= warm_up:
-        rates[program, width] = (stop - group.step) / seconds
+        rates[executable, width] = (stop - group.step) / seconds
     _advanced(group, state, stop)
 
 

@@ -42,7 +42,7 @@ from rtd3jax.training.loop import (
 )
 from rtd3jax.training.plant import plant_of
 from rtd3jax.training.progress import Progress
-from rtd3jax.training.start import Start, starts_of_path
+from rtd3jax.training.start import IN_MEMORY, Start, starts_of_path
 
 _REASONS = {
     ENVIRONMENT_NOT_FINITE: "the environment returned an observation or reward that is not finite; "
@@ -302,7 +302,7 @@ def make_jobs(
     )
     _ = program.agent  # raises UserError, before anything is compiled or written
     starts = starts or {}
-    params = as_arrays(params)  # once, so that all lanes share a recording
+    params = as_arrays(params)  # once, so that the lanes share a recording
     return [
         Job(program, make_lane(config, seed, params), cell, seed, starts.get(seed))
         for seed in seeds
@@ -316,26 +316,16 @@ def check_starts(jobs: Iterable[Job], checkpoints: Checkpoints | None) -> None:
             job.start.check(job.program, job.lane)
 
 
-_IN_MEMORY = "a policy of "
-"""How the name of a start begins that is no path."""
-
-
 def _starts(start: StartLike, seeds: tuple[int, ...]) -> dict[int, Start]:
     """The networks from which each seed starts; empty for new weights."""
     if start is None:
         return {}
     if isinstance(start, Policy):
         digest = hashlib.sha256(b"".join(a.tobytes() for a in start.parameters().values()))
-        name = f"{_IN_MEMORY}{start.algorithm} ({digest.hexdigest()[:12]})"
+        name = f"{IN_MEMORY}{start.algorithm} ({digest.hexdigest()[:12]})"
         return dict.fromkeys(seeds, Start(name, start))
     if isinstance(start, Run):
         return {seed: _starts(start.policy(seed), (seed,))[seed] for seed in seeds}
-    if isinstance(start, str) and start.startswith(_IN_MEMORY):
-        raise UserError(
-            f"the configuration is that of a training that started from {start}, which is in no "
-            "file: pass this policy again as start=..., or train with "
-            'dataclasses.replace(config, start="")'
-        )
     if isinstance(start, str | Path):
         return starts_of_path(start, seeds)
     raise UserError(

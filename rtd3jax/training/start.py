@@ -150,12 +150,22 @@ class Start:
         return dataclasses.replace(state, **found)
 
 
+IN_MEMORY = "a policy of "
+"""How the name of a start begins that is a policy in memory, and not a path."""
+
+
 def starts_of_path(path: str | Path, seeds: tuple[int, ...]) -> dict[int, Start]:
     """The start of each seed, from a saved policy or the ``checkpoint_dir`` of a `rtd.train`.
 
     Raises:
         UserError: when ``path`` is neither of these, or has no checkpoint of a seed.
     """
+    if str(path).startswith(IN_MEMORY):
+        raise UserError(
+            f"the configuration is that of a training that started from {path}, which is in no "
+            "file: pass this policy again as start=..., or train with "
+            'dataclasses.replace(config, start="")'
+        )
     path = user_path(path)
     if not path.is_dir():
         policy = read_policy(path)

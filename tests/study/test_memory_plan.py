@@ -100,7 +100,7 @@ def test_chunks_give_the_same_results():
             assert jnp.allclose(curve, exact, rtol=0 if strategy == "map" else 1e-4)
 
 
-def test_the_plan_counts_a_recording_which_the_lanes_of_a_study_share():
+def test_the_plan_counts_a_recording_which_the_lanes_of_a_cell_share():
     log = np.zeros((250_000, 2), np.float32)
     env = rtd.disturb(rtd.make("rover"), rtd.Recorded(log))
     jobs = make_jobs(env, rtd.Config("td3", total_steps=2_000), [0, 1])

@@ -2,6 +2,8 @@
 
 import json
 import os
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +14,7 @@ from gymnax.environments import environment, spaces
 
 import rtd3jax as rtd
 from rtd3jax.study.plan import Cell
+from rtd3jax.study.plant_code import code_of
 from rtd3jax.study.robustness import run_robustness
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.transfer import transfer
@@ -67,14 +70,13 @@ def test_a_changed_plant_of_the_same_name_is_refused_with_the_difference(tmp_pat
         study(tmp_path, 0.02)
 
 
-def test_what_was_added_is_held_too(tmp_path):
+@pytest.mark.parametrize("name", ("noisy", "logged"))
+def test_what_was_added_is_held_too(tmp_path, name):
     """Also a process, and a recording."""
     study(tmp_path, 0.08)
-    study(tmp_path, 0.08, ("none", "noisy", "logged"))
-    for name in ("noisy", "logged"):
-        with pytest.raises(rtd.UserError, match=f"another plant .* tank-of-a-study {name}"):
-            study(tmp_path, 0.08, (name,), noise=0.3)
-    study(tmp_path, 0.08, ("none",), noise=0.3)  # which that plant does not have
+    study(tmp_path, 0.08, ("none", name))
+    with pytest.raises(rtd.UserError, match=f"another plant .* tank-of-a-study {name}"):
+        study(tmp_path, 0.08, (name,), noise=0.3)
 
 
 def register_changed(**changes):
@@ -118,7 +120,7 @@ def test_code_is_compared_only_as_one_version_of_jax_writes_it(tmp_path):
     assert plan_now(tmp_path) == ""
 
 
-def test_the_numbers_and_settings_of_a_process_are_not_code(tmp_path):
+def test_the_settings_of_a_process_are_not_code(tmp_path):
     study(tmp_path, 0.08)
     with jax.default_matmul_precision("float32"), jax.enable_x64(True):
         assert plan_now(tmp_path) == ""
@@ -146,20 +148,82 @@ def test_a_plant_that_calls_python_has_no_code_to_compare(tmp_path):
     assert plan_now(tmp_path) == ""
 
 
-@pytest.mark.parametrize("test", (transfer, run_robustness))
-def test_trained_agents_are_tested_only_on_the_plant_of_their_study(tmp_path, test):
+def test_the_digest_of_code_is_equal_in_every_process_and_leaves_out_names_and_numbers():
+    command = (
+        "import rtd3jax as rtd; from rtd3jax.study.plant_code import code_of; "
+        "env = rtd.make('pendulum', 'random-sine'); print(code_of(env, env.default_params))"
+    )
+    environment = {**os.environ, "PYTHONHASHSEED": "7"}
+    asked = [sys.executable, "-c", command]
+    there = subprocess.run(asked, env=environment, capture_output=True, text=True, check=True)
+    env = rtd.make("pendulum", "random-sine", m=1.3)
+    here = code_of(env, env.default_params)
+    assert here is not None and there.stdout.strip() == str(here)
+
+    def helped(name):
+        @jax.jit
+        def helper(action):
+            return 2.0 * action
+
+        helper.__wrapped__.__name__ = name
+
+        class Helped(Tank):
+            def step_env(self, key, state, action, params):
+                return super().step_env(key, state, jax.jit(helper.__wrapped__)(action), params)
+
+        return code_of(Helped(), Params())
+
+    assert helped("a_callback") == helped("twice") is not None
+    assert helped("twice") != code_of(Tank(), Params())
+
+
+def test_code_that_a_cpu_cannot_run_is_not_compared(monkeypatch):
+    def fails(*_, **__):
+        raise ValueError("Only interpret mode is supported on CPU backend.")
+
+    monkeypatch.setattr(jax, "eval_shape", fails)
+    assert code_of(Tank(), Params()) is None
+
+
+def test_cells_that_are_continued_without_a_name_are_compared_too(tmp_path):
+    study(tmp_path, 0.08, ("none", "noisy"))
+    rtd.register("tank-of-a-study", Tank(), {"noisy": rtd.GaussianNoise(0.4)}, replace=True)
+    with pytest.raises(rtd.UserError, match="another plant .* tank-of-a-study noisy"):
+        plan_now(tmp_path, ("none",))
+    rtd.register("tank-of-a-study", Tank(), replace=True)
+    assert "continued" in plan_now(tmp_path, ("none",))  # noisy can be read, but not trained
+
+
+def trained_study(path):
     register_changed()
-    cell = Cell("tank-of-a-study", "none", rtd.Config("td3", total_steps=200))
-    rtd.Study([cell], seeds=[0], out=tmp_path, final_episodes=2).run(quiet=True, page=False)
-    directory, lines = RunDirectory.open(tmp_path), []
-    test(directory, None, 2, lines.append)
-    assert not any("computes something else" in line for line in lines)
+    cells = [
+        Cell(env, "none", rtd.Config("td3", total_steps=200))
+        for env in ("tank-of-a-study", "rover")
+    ]
+    rtd.Study(cells, seeds=[0], out=path, final_episodes=2).run(quiet=True, page=False)
+    return RunDirectory.open(path)
+
+
+def test_trained_agents_are_tested_only_on_the_plant_of_their_study(tmp_path):
+    directory, lines = trained_study(tmp_path), []
+    tests = {
+        "transfer": lambda: transfer(directory, ["none"], 2, lines.append),
+        "to another": lambda: transfer(directory, ["dropout"], 2, lines.append),
+        "stress": lambda: run_robustness(directory, ["noise=0.1"], 2, lines.append),
+    }
+    for test in tests.values():
+        assert set(test()["env"]) == {"tank-of-a-study", "rover"}
+    assert lines == []
     register_changed(step_env=other_reward)
-    test(directory, None, 2, lines.append)
-    assert sum("computes something else" in line for line in lines) == 1
+    for test in tests.values():
+        assert set(test()["env"]) == {"tank-of-a-study", "rover"}
+        (line,) = lines
+        assert "the code of tank-of-a-study none computes something else" in line
+        lines.clear()
     rtd.register("tank-of-a-study", Tank(0.02), replace=True)
-    with pytest.raises(rtd.UserError, match="another plant"):
-        test(directory, None, 2, lines.append)
+    for test in tests.values():
+        assert set(test()["env"]) == {"rover"}  # what can be tested is tested
+        assert "another plant" in lines.pop() and not lines
 
 
 def test_a_study_without_its_plants_goes_on_and_states_those_that_are_added(tmp_path):

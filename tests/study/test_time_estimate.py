@@ -87,7 +87,9 @@ def test_no_measurement_outlives_an_interrupt(monkeypatch):
 
     def measure(jobs, device, together):
         begun.append(device)
-        if len(begun) == 2:
+        if device == "second":
+            while len(begun) < 2:
+                time.sleep(0.01)
             os.kill(os.getpid(), signal.SIGINT)  # the main thread handles it
         while not together.broken:
             time.sleep(0.01)

@@ -192,7 +192,7 @@ class FromGymnasium(ValueIdentity, environment.Environment):
         try:
             found, simulator = self.fleet.at(int(handle), place, self._commands(past))
             if simulator is None:
-                raise Fault(self.fleet.failed(found, _other(self.name, place[1])), found)
+                raise Fault(self.fleet.record_fault(found, _other(place[1])), found)
             with faults_of(found):
                 if place[1] >= self._surface.limit:
                     raise simulator.failed(self._too_long("its episode goes on"))
@@ -247,7 +247,7 @@ class FromGymnasium(ValueIdentity, environment.Environment):
             return state.replace(handle=jnp.int32(fault.args[1]))
         if simulator is None:
             self.fleet.release(found)
-            say(f"{_other(self.name, place[1])}; a fresh one begins")
+            say(f"{self.name}: {_other(place[1])}; a fresh one begins")
             return None
         return state.replace(handle=jnp.int32(found))
 
@@ -258,8 +258,8 @@ def _place(seed: _Whole, time: _Whole, digest: ArrayLike) -> tuple[int, int, tup
     return int(seed), int(time), (first, second)
 
 
-def _other(name: str, steps: int) -> str:
-    return f"{name} is not deterministic: its episode, replayed for {steps} steps, was another"
+def _other(steps: int) -> str:
+    return f"it is not deterministic: its episode, replayed for {steps} steps, was another"
 
 
 _told: set[tuple[str, int]] = set()

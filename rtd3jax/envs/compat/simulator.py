@@ -266,10 +266,12 @@ class Fleet:
                 simulator.step(action)
         return handle, simulator if simulator.place == place else None
 
-    def failed(self, handle: int, message: str) -> str:
+    def record_fault(self, handle: int, message: str) -> str:
         """Record a fault of the simulator of ``handle``, and return its text."""
         with self._lock:
-            return str(self._busy[handle].failed(message))
+            simulator = self._busy.get(handle)
+            # Another thread may have closed it.
+            return message if simulator is None else str(simulator.failed(message))
 
     def release(self, handle: int) -> None:
         """Make the simulator free for another episode, unless it has failed."""
