@@ -9,6 +9,7 @@ import jax
 from rtd3jax.study.derive import Reference
 from rtd3jax.study.interim import InterimResults
 from rtd3jax.study.loggers import Logger
+from rtd3jax.study.memory_plan import lanes_in_total
 from rtd3jax.study.plan import label
 from rtd3jax.study.recorder import Recorder
 from rtd3jax.study.rundir import RunDirectory
@@ -66,9 +67,9 @@ def train_here(
     for job in waiting:
         directory.lanes.error_path(*job.key).unlink(missing_ok=True)
     devices = workers()[: work.workers]
-    on_each = work.strategy == "vmap" and len(devices) > 1
-    fit, each = (len(devices), " of each device") if on_each else (1, "")
-    if fit * work.at_once < len(waiting) and not work.quiet:
+    in_total = lanes_in_total(work.at_once, work.strategy, len(devices))
+    if in_total < len(waiting) and not work.quiet:
+        each = " of each device" if in_total > work.at_once else ""
         print(f"the memory is enough for {work.at_once:,} lanes{each}: the others wait")
     checkpoints = checkpoints_of(directory, work.interval)
     groups = make_groups(waiting, work.strategy, len(devices), work.at_once, checkpoints)

@@ -114,6 +114,11 @@ def lanes_at_once(jobs: Sequence[Job], strategy: str, workers: int, memory: int)
     return max(1, fit)
 
 
+def lanes_in_total(at_once: int, strategy: str, devices: int) -> int:
+    """Number of lanes that fit on all devices, from the result of `lanes_at_once`."""
+    return at_once * (devices if strategy == "vmap" else 1)
+
+
 def processes_bytes(jobs: Sequence[Job], processes: int, lanes: int) -> int:
     """Bytes of a study whose lanes are trained by processes besides the one that plans.
 

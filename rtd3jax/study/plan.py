@@ -12,7 +12,7 @@ from rtd3jax.config import Config
 from rtd3jax.envs.registry import make
 from rtd3jax.errors import UserError
 from rtd3jax.registries import AGENTS
-from rtd3jax.study.memory_plan import job_bytes, lanes_at_once
+from rtd3jax.study.memory_plan import job_bytes, lanes_at_once, lanes_in_total
 from rtd3jax.study.time_estimate import study_seconds
 from rtd3jax.training.lanes import Job, workers
 from rtd3jax.training.run import make_jobs
@@ -237,7 +237,7 @@ def plan_text(
     count = len(workers())
     fit = lanes_at_once(jobs, strategy, count, memory)  # before a lane is allocated and timed
     cost = estimate(jobs, strategy, say)
-    in_total = fit * (count if strategy == "vmap" else 1)
+    in_total = lanes_in_total(fit, strategy, count)
     waits = f"; the other {len(jobs) - in_total:,} wait" if in_total < len(jobs) else ""
     lines = [f"{len(cells)} cells × {len(seeds)} seeds = {len(jobs)} lanes"]
     for cell in cells:

@@ -117,17 +117,11 @@ def _difference(before: dict[str, Any], now: dict[str, Any], parts: Iterable[str
 
     A study of an earlier version does not state the names.
     """
-    if not same(before["params"], now["params"]):
-        names = before.get(NAMES, now[NAMES]), now[NAMES]
-        if all(map(_has_names, names, (before, now))):
-            one, other = (
-                dict(zip(own, plant["params"], strict=True))
-                for own, plant in zip(names, (before, now), strict=True)
-            )
+    names = before.get(NAMES, now[NAMES])
+    if len(names) == len(before["params"]):
+        one = dict(zip(names, before["params"], strict=True))
+        other = dict(zip(now[NAMES], now["params"], strict=True))
+        if not same(one, other):
             return difference(one, other)
     ordered = [part for part in now if part in parts]
     return difference({p: before[p] for p in ordered}, {p: now[p] for p in ordered})
-
-
-def _has_names(names: list[str], plant: dict[str, Any]) -> bool:
-    return len(names) == len(plant["params"])

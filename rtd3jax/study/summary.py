@@ -114,26 +114,31 @@ def _failure_lines(failures: Sequence[Mapping]) -> list[str]:
         return ["none"]
     lines = []
     for failure in failures:
-        get = {name: _cell_text(failure.get(name, "?")) for name in (*CELL, "seed", "step")}
-        lines.append(
-            f"- {get['env']}, {get['disturbance']}, {get['algorithm']}, "
-            f"l = {get['history_length']}, seed {get['seed']}, step {get['step']}: "
-            f"{_cell_text(failure.get('reason', 'reason unknown'))}"
-        )
+        lane = _lane_text(*(failure.get(name, "?") for name in (*CELL, "seed")))
+        step = _cell_text(failure.get("step", "?"))
+        reason = _cell_text(failure.get("reason", "reason unknown"))
+        lines.append(f"- {lane}, step {step}: {reason}")
     return sorted(lines)
 
 
 def _diverged_lines(episodes: pd.DataFrame) -> list[str]:
     """One list item per trained lane with final episodes whose return is not a number."""
     lines = []
-    for (env, disturbance, algorithm, length, seed), rows in episodes.groupby([*CELL, "seed"]):
+    for lane, rows in episodes.groupby([*CELL, "seed"]):
         if without := _without_number(rows["return"]):
             lines.append(
-                f"- {_cell_text(env)}, {_cell_text(disturbance)}, {_cell_text(algorithm)}, "
-                f"l = {length}, seed {seed}: {without} of {len(rows)} final episodes have a return "
+                f"- {_lane_text(*lane)}: {without} of {len(rows)} final episodes have a return "
                 "that is not finite, so the lane is left out of the table"
             )
     return lines
+
+
+def _lane_text(
+    env: object, disturbance: object, algorithm: object, length: object, seed: object
+) -> str:
+    """A lane in words, for the lists below the tables."""
+    parts = (env, disturbance, algorithm, f"l = {length}", f"seed {seed}")
+    return ", ".join(map(_cell_text, parts))
 
 
 def _over_episodes(returns: pd.Series) -> str:

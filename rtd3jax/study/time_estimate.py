@@ -8,7 +8,6 @@ by their operations.
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,15 +17,11 @@ from rtd3jax.config import Config
 from rtd3jax.system.interrupts import patient
 from rtd3jax.system.jax_settings import jax_settings, with_settings
 from rtd3jax.training.executables import compiled
-from rtd3jax.training.lanes import Job, stacked, workers
-from rtd3jax.training.loop import Program
+from rtd3jax.training.lanes import Executable, Job, stacked, workers
 
 MOST_PROGRAMS = 4
 """Maximum number of programs that are timed, because each must be compiled."""
 _SECONDS = 1.0
-
-Executable = tuple[Program, Any]
-"""`Job.executable`"""
 
 
 def study_seconds(

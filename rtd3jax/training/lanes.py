@@ -41,6 +41,10 @@ _ENDING = (
 )
 
 
+Executable = tuple[Program, Any]
+"""A program, and the structure of its lanes; see `Job.executable`."""
+
+
 @dataclasses.dataclass(eq=False)
 class Job:
     """One lane to be trained.
@@ -65,7 +69,7 @@ class Job:
         return self.cell, self.seed
 
     @functools.cached_property
-    def executable(self) -> tuple[Program, Any]:
+    def executable(self) -> Executable:
         """Equal for jobs that share executables, and so can advance together.
 
         Equal environments can have parameters of different structure, such as other disturbances.

@@ -32,7 +32,11 @@ TINY = dict(
     eval_episodes=1,
 )
 
-EVERYTHING = """
+EVERYTHING = (
+    f"""
+tiny = {TINY!r}
+"""
+    + """
 import sys
 import numpy as np
 import rtd3jax as rtd
@@ -40,8 +44,6 @@ from rtd3jax import sweep
 from rtd3jax.study import references
 
 references.EPISODES = 2
-tiny = dict(total_steps=40, hidden_size=4, batch_size=4, learning_starts=10, eval_every=20)
-tiny |= dict(eval_episodes=1)
 env = rtd.make("rover", "ar1-slip")
 run = rtd.train(env, rtd.Config("h-td3", history_length=2, **tiny), [0], progress=False)
 assert not run.failures and np.isfinite(run.returns).all()
@@ -56,6 +58,7 @@ command = "--env rover --disturbances ar1-slip --algorithms td3 --seeds 1 --fina
 flags = [f"--{name.replace('_', '-')}={value}" for name, value in tiny.items()]
 sys.exit(sweep.main([*command.split(), *flags, "--quiet", "--no-report", "--out", sys.argv[1]]))
 """
+)
 
 
 def with_switch(switch, code, *arguments):
@@ -101,8 +104,7 @@ def test_environments_stay_in_single_precision_where_double_is_allowed(env_id):
 @pytest.mark.parametrize("algorithm", rtd.ALGORITHMS)
 def test_agents_are_trained_in_single_precision_where_double_is_allowed(algorithm):
     length = None if algorithm == "td3" else 2
-    tiny = dict(total_steps=40, hidden_size=4, batch_size=4, learning_starts=10, eval_every=20)
-    config = rtd.Config(algorithm, length, eval_episodes=1, normalise_observations=True, **tiny)
+    config = rtd.Config(algorithm, length, normalise_observations=True, **TINY)
     with jax.enable_x64(True):
         (job,) = make_jobs(rtd.make("pendulum", "random-sine"), config, [0])
         step = jax.ShapeDtypeStruct((), jnp.int32)
