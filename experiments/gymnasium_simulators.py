@@ -50,6 +50,11 @@ TASKS: dict[str, list[tuple[str, dict[str, Any], int, dict[str, Any]]]] = {
 }
 DEFAULTS = {name: getattr(rtd.Config(), name) for name in SETTING if not name.startswith("eval")}
 """The fields of the pendulum's setting, but with the values of the published TD3."""
+COLUMNS = (
+    *("task", "environment", "algorithm", "steps", "seed", "mean", "curve", "seconds"),
+    "milliseconds",
+)
+"""Rows of `cost` have only ``milliseconds``; ``seconds`` is the time of a whole training."""
 OWN = {
     # An episode ends at an angle of 0.2 rad: raw readings are too small for a network. With these
     # gamma and tau, values reach their level within thousands of updates; still, one of four seeds
@@ -144,7 +149,10 @@ def main(arguments: list[str] | None = None) -> int:
         if task == "cost":
             times = cost(1_100 if options.quick else 5_000)
             rows = [row for row in rows if row["task"] != "cost"]
-            rows += [{"task": "cost", "environment": k, "seconds": v} for k, v in times.items()]
+            rows += [
+                {"task": "cost", "environment": name, "milliseconds": value}
+                for name, value in times.items()
+            ]
             continue
         for index, (name, _, _, fields) in enumerate(TASKS[task]):
             own = (name, fields["algorithm"])
@@ -154,8 +162,8 @@ def main(arguments: list[str] | None = None) -> int:
             options.out.mkdir(parents=True, exist_ok=True)
             pd.DataFrame(rows).to_parquet(path, index=False)
             print(own, [round(row["mean"], 1) for row in rows if row["environment"] == name])
-    table = pd.DataFrame(rows)
-    if "curve" in table:
+    table = pd.DataFrame(rows, columns=COLUMNS)
+    if table["curve"].notna().any():
         options.out.mkdir(parents=True, exist_ok=True)
         draw(table[table["task"] != "cost"], options.out / "gymnasium_simulators.png")
     text = report(table)
@@ -212,7 +220,7 @@ def report(table: pd.DataFrame) -> str:
             f"\n\nPendulum-v1 less our pendulum: {theirs.mean() - ours.mean():+.1f} "
             f"[{found.low:+.1f}, {found.high:+.1f}] (95%).\n"
         )
-    times = table[table["task"] == "cost"].set_index("environment")["seconds"].to_dict()
+    times = table[table["task"] == "cost"].set_index("environment")["milliseconds"].to_dict()
     if times:
         extra = times["simulated"] - times["own"] - times["simulator"]
         text += (
