@@ -1,6 +1,6 @@
 """Estimates the memory of lanes before allocation, and how many lanes fit together."""
 
-import functools
+import weakref
 from collections.abc import Sequence
 from typing import Any
 
@@ -31,6 +31,13 @@ PROCESS_BYTES = 1_150 * 2**20
 
 WORKER_BYTES = 700 * 2**20
 """Bytes of a process that only trains, without lanes: Python, JAX and compiled programs."""
+
+
+_MEASURED: weakref.WeakKeyDictionary[Job, tuple[int, int]] = weakref.WeakKeyDictionary()
+"""The bytes of lanes: several parts of a plan ask for the same lane, and each answer traces it.
+
+The references are weak, because a lane can hold a recording.
+"""
 
 
 def state_bytes(job: Job) -> int:
@@ -73,13 +80,14 @@ def job_bytes(jobs: Sequence[Job]) -> dict[Any, tuple[int, int]]:
     return {executable: _lane_bytes(job) for executable, job in examples.items()}
 
 
-# Several parts of a plan ask for the same lanes; each lane is traced for it.
-@functools.lru_cache(maxsize=512)
 def _lane_bytes(job: Job) -> tuple[int, int]:
     """State bytes and temporary bytes of a lane."""
-    program = job.program
-    actions = program.bounds(job.lane).low.shape[0]
-    return state_bytes(job), working_bytes(program.config, program.observation_size, actions)
+    if job not in _MEASURED:
+        program = job.program
+        actions = program.bounds(job.lane).low.shape[0]
+        work = working_bytes(program.config, program.observation_size, actions)
+        _MEASURED[job] = state_bytes(job), work
+    return _MEASURED[job]
 
 
 def _largest(jobs: Sequence[Job]) -> tuple[int, int]:

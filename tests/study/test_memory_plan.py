@@ -1,6 +1,8 @@
 """Compares the memory plan with XLA's reservations, and tests the split of lanes."""
 
+import gc
 import time
+import weakref
 
 import jax
 import jax.numpy as jnp
@@ -109,6 +111,15 @@ def test_the_plan_counts_a_recording_which_the_lanes_of_a_cell_share():
     assert 0 <= kept - without - log.nbytes < 1_000
     one, other = (jax.tree.leaves(job.lane.env_params) for job in jobs)
     assert all(a is b for a, b in zip(one, other, strict=True))
+
+
+def test_the_plan_does_not_keep_a_lane_in_memory():
+    (job,) = _jobs()
+    memory_plan.job_bytes([job])
+    gone = weakref.ref(job)
+    del job
+    gc.collect()
+    assert gone() is None
 
 
 def test_the_plan_looks_at_every_disturbance_of_an_environment():
