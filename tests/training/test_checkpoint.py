@@ -41,9 +41,8 @@ def whole():
     return _train()
 
 
-@pytest.fixture
-def stopped(tmp_path, monkeypatch):
-    """A directory of checkpoints of a training that was interrupted, with chunks of few steps."""
+def _interrupt(directory, monkeypatch, **options):
+    """Train with chunks of few steps, until an interrupt; checkpoints remain."""
     chunks = []
 
     def interrupt(_):
@@ -56,9 +55,15 @@ def stopped(tmp_path, monkeypatch):
         patch.setattr(lanes, "CHUNK_SECONDS", 0.0)
         patch.setattr(run.Progress, "update", lambda self, group: interrupt(group))
         with pytest.raises(KeyboardInterrupt):
-            _train(tmp_path, checkpoint_seconds=0.0)
-    files = list(tmp_path.rglob("*.safetensors"))
+            _train(directory, checkpoint_seconds=0.0, **options)
+    files = list(directory.rglob("*.safetensors"))
     assert files and not any("000000120" in file.name for file in files)
+
+
+@pytest.fixture
+def stopped(tmp_path, monkeypatch):
+    """A directory of checkpoints of a training that was interrupted."""
+    _interrupt(tmp_path, monkeypatch)
     return tmp_path
 
 
@@ -72,6 +77,26 @@ def _assert_same(one, other):
 
 def test_an_interrupted_training_goes_on_to_the_same_bits(stopped, whole):
     _assert_same(_train(stopped), whole)
+
+
+@pytest.mark.parametrize(
+    ("options", "changes"),
+    [
+        (dict(strategy="vmap"), {}),
+        ({}, dict(replay="segments", segment_length=4, acting="carry")),
+        ({}, dict(environments=4)),
+        ({}, dict(algorithm="lstm-td3-privileged")),
+    ],
+)
+def test_every_kind_of_training_goes_on_to_the_same_bits(tmp_path, monkeypatch, options, changes):
+    """Episodes end before and after the interrupt."""
+    options = dict(
+        options,
+        config=dataclasses.replace(CONFIG, **changes),
+        env=rtd.make("pendulum", "random-sine", max_steps_in_episode=25),
+    )
+    _interrupt(tmp_path, monkeypatch, **options)
+    _assert_same(_train(tmp_path, **options), _train(**options))
 
 
 def test_a_finished_training_is_not_repeated(tmp_path, whole, monkeypatch):

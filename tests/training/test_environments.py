@@ -129,6 +129,56 @@ def test_a_segment_is_consecutive_steps_of_one_environment(lane):
             assert starts[LENGTH + step, index] == begins
 
 
+def test_a_segment_starts_from_its_own_environments_carry():
+    """The actions are those from windows that reach back to the start of the episode."""
+    config = rtd.Config(
+        algorithm="h-td3",
+        replay="segments",
+        segment_length=4,
+        learning_starts=STEPS,
+        replay_capacity=CAPACITY,
+        **FIELDS,
+    )
+    program, _, state = _lane(config, (0, STEPS))
+    length, burn_in, whole_episode, count = 4, 2, 7, jnp.int32(STEPS)
+    oldest = STEPS - CAPACITY + (burn_in + whole_episode) * K
+    first = jnp.arange(oldest, STEPS - length * K, dtype=jnp.int32)
+    segments = gather_segments(
+        state.replay,
+        first,
+        count,
+        burn_in,
+        burn_in,
+        length,
+        True,
+        critic_reads_carries=False,
+        actor_reads_carries=True,
+    )
+    numbers = (first[None] + K * jnp.arange(length, dtype=jnp.int32)[:, None]).reshape(-1)
+    windows = gather(state.replay, numbers, count, whole_episode, whole_episode)
+    network, actor = program.agent.acting_actor, state.learner.actor
+    for name in ("window", "next_window"):
+        expected = act(network, actor, getattr(windows, name))
+        found = act(network, actor, getattr(segments, name))
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+    without = act(network, actor, windows.window.replace(length=jnp.zeros_like(numbers)))
+    assert not np.allclose(without, act(network, actor, windows.window), atol=1e-4)
+
+
+def test_lanes_side_by_side_store_what_each_stores_alone(lane):
+    program = lane[0]
+    lanes = [make_lane(program.config, seed, Clock().default_params) for seed in (0, 1)]
+
+    def replay(lane):
+        return program.advance(lane, program.init(lane), jnp.int32(0), jnp.int32(STEPS)).replay
+
+    together = jax.jit(jax.vmap(replay))(jax.tree.map(lambda *x: jnp.stack(x), *lanes))
+    for index, own in enumerate(lanes):
+        alone = jax.tree.leaves(jax.jit(replay)(own))
+        for one, all_lanes in zip(alone, jax.tree.leaves(together), strict=True):
+            np.testing.assert_allclose(all_lanes[index], one, atol=1e-6)
+
+
 def test_stored_carries_are_those_with_which_the_actor_acted(lane):
     """The greedy action from a stored carry is the one that was done, but for the noise."""
     program, lane_, state = lane

@@ -19,7 +19,7 @@ from rtd3jax.study.starts import add_starts, starts_of
 from rtd3jax.system.files import read_arrays, write_arrays
 from rtd3jax.training import lanes
 from rtd3jax.training.run import make_jobs
-from rtd3jax.training.start import KNOWN_OBSERVATIONS, starts_of_path
+from rtd3jax.training.start import KNOWN_OBSERVATIONS, Start, starts_of_path
 
 SMALL = dict(
     algorithm="td3",
@@ -103,6 +103,31 @@ def test_a_lane_acts_by_the_policy_while_parts_stay_and_the_actor_waits(env, kep
         assert critic == {"current": True, "head": False, "output": False}
     targets = before.target_actor, after.target_actor
     assert {layer: _same(targets[0][layer], targets[1][layer]) for layer in actor} == actor
+
+
+@pytest.mark.parametrize("algorithm", ["lstm-td3", "lstm-td3-1ha1hc", "h-td3"])
+def test_a_lane_acts_as_its_policy_does_also_after_an_episode(algorithm):
+    env = rtd.make("rover", "sine-slip", max_steps_in_episode=5)
+    policy = random_policy(algorithm, env)
+    config = _config(
+        algorithm=algorithm,
+        history_length=3,
+        start="p",
+        exploration_noise=0.0,
+        normalise_observations=False,
+    )
+    start = Start("p", policy)
+    (job,) = make_jobs(env, config, [0], starts={0: start})
+    state = start.begin(job.program, job.lane, jax.jit(job.program.init)(job.lane))
+    steps = 17  # no update comes before step 20
+    state = jax.jit(job.program.advance)(job.lane, state, jnp.int32(0), jnp.int32(steps))
+    rows, memory = state.replay.transitions, policy.init()
+    for index in range(steps):
+        if rows.episode_step[index] == 0:
+            memory = policy.init()
+        action, memory = policy.step(memory, rows.step.observation[index])
+        np.testing.assert_allclose(rows.step.action[index], action, atol=1e-5)
+    assert np.sum(rows.episode_step[:steps] == 0) == 4 and np.ptp(rows.step.action[:steps]) > 0.1
 
 
 def test_a_whole_network_may_be_frozen():

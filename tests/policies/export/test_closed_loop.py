@@ -141,6 +141,41 @@ def test_one_onnx_and_one_stablehlo_file_serve_every_batch_size(tmp_path):
         np.testing.assert_allclose(onnx_action, action, atol=1e-5)
 
 
+def _play(player, observations):
+    player.reset()
+    return np.stack([player.step(row) for row in observations])
+
+
+@pytest.mark.parametrize("memory, length", [("lstm", 1), ("gru", 1), ("gru", 3), ("min-gru", 3)])
+@pytest.mark.parametrize("agent", ["lstm-td3", "lstm-td3-1ha1hc"])
+def test_windows_of_every_memory_in_every_form(tmp_path, agent, memory, length):
+    policy = random_policy(
+        agent, rtd.make("rover", "ar1-slip"), memory=memory, length=length, scale=2.0
+    )
+    rows = np.random.default_rng(0).normal(size=(1, 8, 1, 2)).astype(np.float32)
+    expected = np.asarray(_replay(policy, rows))[0, :, 0]
+    assert np.ptp(expected, axis=0).min() > 1e-2
+    for form in FORMATS:
+        path = tmp_path / ("p" + FORMATS[form][0])
+        policy.export(path, format=form)
+        found = _play(PLAYERS[form](path), rows[0, :, 0])
+        np.testing.assert_allclose(found, expected, atol=TOLERANCE, err_msg=form)
+
+
+@pytest.mark.parametrize("form", ["onnx", "stablehlo"])
+@pytest.mark.parametrize("agent", rtd.ALGORITHMS)
+def test_the_action_after_a_nan_is_nan(tmp_path, agent, form):
+    """Of agents that read no actions, it leaves with the window (three steps)."""
+    policy = random_policy(agent, rtd.make("rover", "ar1-slip"))
+    path = tmp_path / ("p" + FORMATS[form][0])
+    policy.export(path, format=form)
+    rows = np.zeros((8, 2), np.float32)
+    rows[2] = np.nan
+    found = np.isnan(_play(PLAYERS[form](path), rows)).all(axis=1)
+    ends = {"td3": 3, "lstm-td3-no-action": 6}.get(agent, 8)
+    np.testing.assert_array_equal(found, [2 <= step < ends for step in range(8)])
+
+
 @pytest.mark.parametrize("form", FORMATS)
 def test_a_saturated_action_is_a_bound_exactly(form, tmp_path):
     """In float32, 0.3 - 0.6 is less than -0.3."""
