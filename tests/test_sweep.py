@@ -1,6 +1,7 @@
 """Tests of the sweep's command: its files, its errors, and its continuation."""
 
 import json
+import math
 
 import jax
 import numpy as np
@@ -9,9 +10,10 @@ import pytest
 
 from rtd3jax import compare, report, sweep
 from rtd3jax.agents.variants import ALGORITHMS
+from rtd3jax.cli import sweep_options
 from rtd3jax.config import Config
 from rtd3jax.envs import registry
-from rtd3jax.study import finish, presets, recorder, references, time_estimate
+from rtd3jax.study import finish, interim, presets, recorder, references, time_estimate
 from rtd3jax.study.plan import Cell, Grid, make_cells
 from rtd3jax.study.presets import PRESETS
 from rtd3jax.study.results import CURVES, EPISODES, read_table
@@ -209,13 +211,53 @@ def test_status_names_every_lane(tmp_path, capsys):
     )
 
 
+@pytest.mark.parametrize(
+    ("text", "interval"),
+    [
+        ("auto", (None, None)),
+        ("30s", (30.0, None)),
+        ("5m", (300.0, None)),
+        ("1h", (3_600.0, None)),
+        ("2000steps", (math.inf, 2_000)),
+    ],
+)
+def test_intervals_of_checkpoints(text, interval):
+    assert sweep_options.parse_interval(text) == interval
+
+
+def test_tables_during_a_study_hold_the_lanes_that_have_ended(tmp_path, monkeypatch):
+    rows, real = [], interim.derive
+
+    def derive(directory, *rest):
+        real(directory, *rest)
+        rows.append(len(read_table(directory.path / "curves.parquet", CURVES)))
+
+    monkeypatch.setattr(interim, "SECONDS", -1.0)
+    monkeypatch.setattr(interim, "derive", derive)
+    assert sweep.main([*TINY, "--out", str(tmp_path / "run")]) == 0
+    assert rows == [2, 4, 6, 8]  # two evaluations of each lane
+
+
+def _files(directory):
+    return {
+        file.relative_to(directory): file.read_bytes()
+        for file in directory.rglob("*")
+        if file.is_file()
+    }
+
+
 def test_fresh_keeps_what_was_there(tmp_path, capsys):
     out = tmp_path / "run"
     assert sweep.main([*TINY, "--out", str(out)]) == 0
+    before = _files(out)
     changed = [*TINY, "--out", str(out), "--fresh", "--gamma", "0.5"]
     assert sweep.main(changed) == 0
-    assert (tmp_path / "run.old-1" / "curves.parquet").exists()
     assert "0.5" in (out / "summary.md").read_text()
+    assert _files(tmp_path / "run.old-1") == before
+    changed[-1] = "0.25"
+    assert sweep.main(changed) == 0
+    assert _files(tmp_path / "run.old-1") == before
+    assert "0.5" in (tmp_path / "run.old-2" / "summary.md").read_text()
 
 
 def test_fresh_does_not_rename_the_working_directory(tmp_path, monkeypatch, capsys):
@@ -320,7 +362,11 @@ def test_a_full_disk_is_one_line_and_loses_nothing(tmp_path, monkeypatch, capsys
     error = capsys.readouterr().err
     assert "No space left on device" in error and error.count("\n") == 1
     assert not list(out.rglob("*.tmp"))
+    kept = {file: file.read_bytes() for file in out.glob("lanes/**/*.safetensors")}
+    assert kept
     assert sweep.main([*TINY, "--out", str(out)]) == 0
+    assert f"{len(kept)} of 4 lanes have ended already" in capsys.readouterr().out
+    assert all(file.read_bytes() == content for file, content in kept.items())
 
 
 def test_a_module_that_registers_environments_can_be_imported(tmp_path, monkeypatch, capsys):

@@ -14,10 +14,11 @@ import jax
 import pytest
 
 from rtd3jax import sweep
-from rtd3jax.study import finish, recorder
+from rtd3jax.study import execute, finish, recorder
 from rtd3jax.study.derive import derive
 from rtd3jax.study.log import LOG, lane_of, read_log
 from rtd3jax.study.rundir import RunDirectory
+from rtd3jax.training import lanes
 
 STUDY = [
     *("--env", "rover", "--disturbances", "ar1-slip", "--algorithms", "td3", "h-td3"),
@@ -156,8 +157,10 @@ def test_sigterm_leaves_checkpoints_and_the_rest_is_the_same(whole, tmp_path, mo
         if group.step >= 40:
             os.kill(os.getpid(), signal.SIGTERM)
 
+    two = (lanes.workers() * 2)[:2]  # so that some of the four lanes have not begun
     with one_step_chunks(monkeypatch) as patch:
         patch.setattr(recorder.Recorder, "update", update)
+        patch.setattr(execute, "workers", lambda: two)
         assert run(out) == 143
     assert "repeat the command to train the lanes" in capsys.readouterr().out
     assert list(out.rglob("step-*.safetensors"))
@@ -192,8 +195,6 @@ def test_one_worker_finishes_what_two_began(whole, tmp_path, monkeypatch):
     with one_step_chunks(monkeypatch) as patch:
         patch.setattr(recorder.Recorder, "update", interrupt)
         assert run(out) == 130
-    from rtd3jax.training import lanes
-
     one = lanes.workers()[:1]
     monkeypatch.setattr(lanes, "workers", lambda: one)
     assert run(out) == 0
@@ -246,21 +247,21 @@ def test_two_processes_with_a_shard_each_merge_to_the_same_tables(whole, tmp_pat
     assert contents(out) == contents(whole)
 
 
-def test_tables_wait_for_another_shards_tables(whole):
+def test_tables_wait_for_another_shards_tables(whole, tmp_path, monkeypatch):
     from rtd3jax.study.lock import deriver
 
-    directory = RunDirectory.open(whole)
-    with deriver(whole):
+    out = tmp_path / "run"
+    shutil.copytree(whole, out)
+    module = sys.modules["rtd3jax.study.derive"]
+    real, entered = module._derive, threading.Event()
+    monkeypatch.setattr(module, "_derive", lambda *args: (entered.set(), real(*args)))
+    directory = RunDirectory.open(out)
+    with deriver(out):
         thread = threading.Thread(target=derive, args=(directory, []), kwargs={"pictures": False})
         thread.start()
-        time.sleep(0.3)
-        assert thread.is_alive()
-    before = contents(whole)
+        assert not entered.wait(0.3)
     thread.join()
-    assert len(contents(whole)) == len(before)
-    # Put back what the other tests compare with.
-    for name, content in before.items():
-        (whole / name).write_bytes(content)
+    assert entered.is_set()
 
 
 @pytest.mark.parametrize(

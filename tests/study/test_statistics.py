@@ -68,6 +68,16 @@ def test_interval_matches_an_enumerated_bootstrap():
     assert summary.iqm_high == pytest.approx(np.quantile(iqms, 0.975), abs=2.5)
 
 
+def test_interval_of_many_seeds_has_the_quantiles_of_resampled_means():
+    """The distribution is nearly continuous, so it shows the level: 95%."""
+    values = np.random.default_rng(0).normal(size=40)
+    chosen = np.sort(np.random.default_rng(1).choice(values, (20_000, 40)), axis=1)
+    low, high = np.quantile(chosen[:, 10:30].mean(axis=1), [0.025, 0.975])
+    summary = summarise(values)
+    found = summary.iqm_low, summary.iqm_high
+    assert found == pytest.approx((low, high), abs=0.05 * (high - low))
+
+
 def test_interval_narrows_with_more_seeds():
     values = np.random.default_rng(1).normal(size=64)
     few, many = summarise(values[:8]), summarise(values)

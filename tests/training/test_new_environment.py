@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from flax import struct
 from gymnax.environments import environment, spaces
 
@@ -37,7 +38,42 @@ class Cart(environment.Environment):
         return spaces.Box(-1.0, 1.0, (1,))
 
 
-def test_a_new_environment_trains_and_its_terminations_count():
+class OneStep(Cart):
+    """Episodes of one step with a reward of one; they end by a termination or by a time limit."""
+
+    def __init__(self, terminates):
+        super().__init__()
+        self.terminates = terminates
+
+    def step_env(self, key, state, action, params):
+        observation, state, _, _, info = super().step_env(key, state, action, params)
+        return observation, state, jnp.float32(1.0), jnp.asarray(self.terminates), info
+
+    def is_truncated(self, state, params):
+        return jnp.asarray(not self.terminates)
+
+
+@pytest.mark.parametrize("terminates", [True, False])
+def test_a_target_has_a_value_after_a_time_limit_but_not_after_a_termination(terminates):
+    config = rtd.Config(
+        algorithm="td3",
+        total_steps=400,
+        hidden_size=8,
+        batch_size=16,
+        learning_starts=20,
+        gamma=0.5,
+        tau=0.2,
+        eval_every=100,
+        eval_episodes=1,
+    )
+    run = rtd.train(OneStep(terminates), config, [0], progress=False)
+    np.testing.assert_array_equal(run.returns, 1.0)
+    target = run.metrics["target"][0, -1]
+    # The value of a reward of one per step without end is 1 / (1 - gamma).
+    assert target == pytest.approx(1.0 if terminates else 2.0, rel=0.1)
+
+
+def test_a_new_environment_trains():
     env = Cart()
     config = rtd.Config(
         algorithm="lstm-td3-1ha2hc",

@@ -161,7 +161,8 @@ def test_a_simulator_composes_with_a_disturbance_and_is_reset_at_ends_alone():
     ],
 )
 def test_a_simulator_that_fails_says_how_and_stays_lost(fault, message):
-    fleet = environment(fault=fault, at=2, step_seconds=0.3).fleet
+    seconds = 0.3 if fault == "hang" else 60.0
+    fleet = environment(fault=fault, at=2, step_seconds=seconds).fleet
     handle, _, _ = fleet.reset(-1, 5)
     place = fleet._busy[handle].place
     action = np.zeros(2, np.float32)
