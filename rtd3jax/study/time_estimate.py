@@ -17,7 +17,7 @@ from rtd3jax.config import Config
 from rtd3jax.system.interrupts import patient
 from rtd3jax.system.jax_settings import jax_settings, with_settings
 from rtd3jax.training.executables import compiled
-from rtd3jax.training.lanes import Executable, Job, stacked, workers
+from rtd3jax.training.lanes import Executable, Job, advances_alone, stacked, workers
 
 MOST_PROGRAMS = 4
 """Maximum number of programs that are timed, because each must be compiled."""
@@ -35,7 +35,7 @@ def study_seconds(
     Args:
         jobs: the jobs, one for each lane.
         strategy: with ``map``, a worker trains one lane after the other; with ``vmap``, it trains
-            its share of a program's lanes together.
+            its share of a program's lanes together, but lanes with simulators one after the other.
         operations: returns the operations of a configuration per environment step, by which times
             are interpolated.
         say: receives a line before each measurement.
@@ -52,12 +52,14 @@ def study_seconds(
         own = lanes[executables[place]]
         config = own[0].program.config
         say(f"timing {number} of {len(places)}: {config.algorithm} l={config.window_tokens}")
-        width = 1 if strategy == "map" else -(-len(own) // devices)
+        width = 1 if advances_alone(own[0], strategy) else -(-len(own) // devices)
         timed[executables[place]] = group_seconds(own[:width])
     whole = _filled_in(executables, timed, operations)
-    if strategy == "map":
-        return sum(whole[job.executable] for job in jobs) / devices
-    return sum(whole.values())
+    # A worker's lanes of a program: one after the other, or together.
+    return sum(
+        seconds * (len(own) / devices if advances_alone(own[0], strategy) else 1)
+        for own, seconds in ((lanes[executable], whole[executable]) for executable in executables)
+    )
 
 
 def group_seconds(jobs: Sequence[Job]) -> float:

@@ -3,7 +3,8 @@
 A *group* is a set of lanes that one call of a compiled program advances. On a CPU, a group is a
 single lane: the results of a lane then do not depend on other lanes, and no product is split over
 threads. On an accelerator, a group holds all lanes of a program under ``vmap``, because wider
-products cost little there. Each worker takes the group with the fewest steps, so that five lanes
+products cost little there; a lane with a simulator on the host is a group of its own there, too.
+Each worker takes the group with the fewest steps, so that five lanes
 keep two cores equally busy.
 """
 
@@ -20,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rtd3jax.envs.compat.simulated import fleet_of
+from rtd3jax.envs.compat.simulated import fleet_of, is_simulated
 from rtd3jax.envs.compat.simulator_state import simulator_handles
 from rtd3jax.errors import UserError
 from rtd3jax.system.interrupts import patient
@@ -156,6 +157,14 @@ def _default_device() -> Any:
     return device or jax.local_devices()[0]
 
 
+def advances_alone(job: Job, strategy: str) -> bool:
+    """Whether a lane is a group of its own: under ``map``, and with a simulator on the host.
+
+    JAX cannot batch conditions and loops that call a simulator.
+    """
+    return strategy == "map" or is_simulated(job.program.env)
+
+
 def make_groups(
     jobs: Sequence[Job],
     strategy: str,
@@ -164,6 +173,8 @@ def make_groups(
     checkpoints: Checkpoints | None = None,
 ) -> list[Group]:
     """Groups of one lane (``map``), or one group per program and device (``vmap``).
+
+    Lanes with simulators also form groups of one lane under ``vmap``.
 
     With ``checkpoints``, only lanes that have checkpoints at a common step form a group, so a new
     lane does not make the others start from the beginning. Groups that were interrupted at
@@ -177,7 +188,8 @@ def make_groups(
         return [Group([job], wave=index // most) for index, job in enumerate(jobs)]
     by_executable: dict[Any, list[Job]] = {}
     for job in jobs:
-        by_executable.setdefault(job.executable, []).append(job)
+        together = job if advances_alone(job, strategy) else job.executable
+        by_executable.setdefault(together, []).append(job)
     steps_of = checkpoints.steps if checkpoints is not None else lambda job: set()
     shares = []
     for members in by_executable.values():
@@ -409,8 +421,9 @@ def _advanced(group: Group, state: LaneState, step: int) -> None:
     metrics = np.asarray(state.metrics.curves)
     group.metrics = metrics if metrics.ndim == 3 else metrics[None]
     group.simulators = simulator_handles(state.env_state)
-    group.lost = bool(np.all(np.asarray(state.failure) != HEALTHY))
-    group.state, group.step = state, step
+    lost = bool(np.all(np.asarray(state.failure) != HEALTHY))
+    # The main thread may read at any time: a group that has ended has its last state.
+    group.state, group.step, group.lost = state, step, lost
 
 
 def stacked(lanes: Sequence[Lane], device: jax.Device) -> Lane:
