@@ -416,7 +416,8 @@ class Config:
     def updates_before_the_actor(self) -> int:
         """Critic updates before the actor is first updated."""
         first = self.first_learning_step * self.environments
-        return max(0, -(-(self.first_actor_step - first) // self.update_every))
+        rounds = -(-(self.first_actor_step - first) // max(self.update_every, self.environments))
+        return max(0, rounds) * self.updates_per_round
 
     @property
     def capacity(self) -> int:

@@ -12,12 +12,13 @@ import jax
 import pytest
 
 from rtd3jax import sweep
+from rtd3jax.config import Config
 from rtd3jax.errors import UserError
 from rtd3jax.study import cluster, hosts
 from rtd3jax.study.execute import Work
 from rtd3jax.study.log import LOG
 from rtd3jax.study.log_reader import LogReader
-from rtd3jax.study.plan import Grid, cell_jobs, make_cells
+from rtd3jax.study.plan import Cell, Grid, cell_jobs, make_cells
 from rtd3jax.study.rundir import RunDirectory
 
 STUDY = [
@@ -66,6 +67,16 @@ def test_two_processes_with_half_the_devices_each_give_the_bits_of_one_with_all(
         assert one.returncode == 0, error.decode()[-2000:]
     found = contents(joined)
     assert len(found) == 3 + 3 and found == contents(alone)
+
+
+def test_a_relative_start_is_refused_on_a_cluster():
+    cells = [
+        Cell("rover", "none", Config("td3", start=start)) for start in ("", "/shared/a", "~/a")
+    ]
+    cluster._check_starts(cells)
+    relative = Cell("rover", "none", Config("td3", start="runs/a@none"))
+    with pytest.raises(UserError, match="--start runs/a@none is relative.* absolute path"):
+        cluster._check_starts([*cells, relative])
 
 
 def test_a_process_without_a_job_is_told_what_to_set(tmp_path):

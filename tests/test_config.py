@@ -71,6 +71,10 @@ def test_the_actor_starts_with_learning_unless_it_is_told_when():
     fields = dict(learning_starts=1_009, actor_starts=1_024, eval_every=992)
     many = rtd.Config(environments=16, **fields)
     assert many.updates_before_the_actor == 0
+    # The first round with updates of the actor is the first one that follows its step.
+    fields = dict(learning_starts=1_008, actor_starts=1_009, eval_every=992)
+    late = rtd.Config(environments=16, update_every=1, total_steps=30_000, **fields)
+    assert late.updates_before_the_actor == 16
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ import pytest
 from rtd3jax import sweep
 from rtd3jax.study import execute, finish, recorder
 from rtd3jax.study.derive import derive
-from rtd3jax.study.log import LOG, lane_of, read_log
+from rtd3jax.study.log import LOG, append_rows, lane_of, read_log
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.training import lanes
 
@@ -223,6 +223,24 @@ def test_the_log_has_each_evaluation_once_however_often_it_was_cut(whole, tmp_pa
     keys = [tuple(list(json.loads(line).values())[:6]) for line in log]
     assert len(keys) == len(set(keys)) == 2 * 2 * 4
     assert len(read_log(out / LOG)) == len(keys)
+
+
+def test_rows_of_the_log_that_fit_only_in_part_are_written_to_the_end():
+    class Part:
+        """A file that takes ten bytes at a time."""
+
+        content = b""
+
+        def open(self, *_, **__):
+            return contextlib.nullcontext(self)
+
+        def write(self, data):
+            self.content += data[:10]
+            return min(len(data), 10)
+
+    path, rows = Part(), [{"step": 1, "return": 2.0}, {"step": 2, "return": 3.0}]
+    append_rows(path, rows)
+    assert [json.loads(line) for line in path.content.splitlines()] == rows
 
 
 @pytest.mark.slow

@@ -417,10 +417,13 @@ def _action_size(base: ComposableEnvironment, params: object) -> int:
 
 
 def _observation_size(base: ComposableEnvironment, params: object) -> int:
-    """Elements of the undisturbed observation; many environments declare no observation space."""
+    """Elements of the undisturbed observation; many environments do not declare its space."""
     with foreign_code():
         try:
-            return base.observation_space(params).shape[0]
+            shape = base.observation_space(params).shape
         except (AttributeError, NotImplementedError):
-            key = jax.eval_shape(lambda: jax.random.key(0))
-            return jax.eval_shape(base.reset_env, key, params)[0].shape[0]
+            shape = ()
+        if len(shape) == 1:
+            return shape[0]
+        key = jax.eval_shape(lambda: jax.random.key(0))
+        return jax.eval_shape(base.reset_env, key, params)[0].shape[0]

@@ -8,10 +8,11 @@ import jax
 import numpy as np
 from jax.typing import ArrayLike
 
+from rtd3jax.envs.compat.surface import within_bounds
 from rtd3jax.envs.entry import DEFAULT_STEP_LIMIT
 from rtd3jax.errors import UserError, short_reason
 from rtd3jax.evaluation.returns import check_counts
-from rtd3jax.policies.compatibility import check_compatible
+from rtd3jax.policies.compatibility import check_compatible, fitted
 from rtd3jax.policies.trained import Policy
 from rtd3jax.protocols import PolicyLike
 from rtd3jax.system.pytrees import node_types
@@ -22,8 +23,8 @@ def run_in_gymnasium(
 ) -> np.ndarray:
     """Returns of whole episodes: float64 [episodes].
 
-    The action is clipped to the environment's bounds. An episode that has not ended after 10,000
-    steps is cut.
+    The action is clipped to the environment's bounds, and rounded if these are whole numbers. An
+    episode that has not ended after 10,000 steps is cut.
 
     Args:
         policy: anything with ``init`` and ``step``; see `rtd3jax.policies`.
@@ -52,6 +53,8 @@ def run_in_gymnasium(
 
 def _play(policy: PolicyLike, env: gymnasium.Env, episodes: int, seed: int) -> np.ndarray:
     space = _check_spaces(policy, env)
+    policy = fitted(policy, space.shape)
+    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
     types = node_types(policy)
     returns = np.zeros(episodes)
     # Each episode gets its own seed, so that neighbouring values of ``seed`` share no episodes.
@@ -64,8 +67,8 @@ def _play(policy: PolicyLike, env: gymnasium.Env, episodes: int, seed: int) -> n
                 _check_finite(where, "environment's observation", observation)
             action, state = _act(policy, state, np.asarray(observation, np.float32), types)
             _check_finite(where, "policy's action", action)
-            action = np.clip(np.asarray(action, space.dtype), space.low, space.high)
-            observation, reward, terminated, truncated, _ = env.step(action)
+            command = within_bounds(np.asarray(action), low, high, space.dtype)
+            observation, reward, terminated, truncated, _ = env.step(command)
             reward = float(reward)
             _check_finite(where, "environment's reward", reward)
             returns[index] += reward
@@ -102,6 +105,7 @@ def _check_spaces(policy: PolicyLike, env: gymnasium.Env) -> gymnasium.spaces.Bo
             "wrap it in gymnasium.wrappers.FlattenObservation"
         )
     check_compatible(policy, observations.shape[0], actions.shape, actions.low, actions.high)
+    policy = fitted(policy, actions.shape)
     kind = type(policy).__name__
     seen = jax.ShapeDtypeStruct(observations.shape, np.float32)
     try:

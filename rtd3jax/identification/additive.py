@@ -68,6 +68,8 @@ def fit_noise(parts: Sequence[np.ndarray], max_slip: float | None = None) -> Fit
     # As in the other fits, only values with a previous value count, so that AIC is comparable.
     _, values = transitions(parts)
     variance = float(np.mean(values**2))
+    if variance == 0.0:
+        raise UserError("noise: all values except the first are zero, so nothing can be fitted")
     mean, error = float(values.mean()), float(values.std()) / math.sqrt(values.size)
     notes = []
     if abs(mean) > 4.0 * error:

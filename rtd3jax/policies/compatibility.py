@@ -41,10 +41,7 @@ def check_compatible(
             f"the policy expects {expected} observation elements, the environment gives "
             f"{observation_size}: {remedy}"
         )
-    constant = getattr(policy, "action", None)
-    given = _action_shape(policy, observation_size)
-    if isinstance(constant, jax.Array) and constant.size == int(np.prod(action_shape)):
-        return  # a constant action may be flat
+    given = _action_shape(fitted(policy, action_shape), observation_size)
     if given is not None and given != action_shape:
         raise UserError(
             f"the policy's action has shape {given}, the environment's {action_shape}: {remedy}"
@@ -53,7 +50,9 @@ def check_compatible(
 
 
 def fitted(policy: PolicyLike, action_shape: tuple[int, ...]) -> Any:
-    """``policy``; if its action is constant and flat, the action gets the environment's shape."""
+    """``policy``; flat actions that are constant, or of a function, get the environment's shape."""
+    if callable(reshaped := getattr(policy, "with_action_shape", None)):
+        return reshaped(action_shape)
     constant = getattr(policy, "action", None)
     if not isinstance(constant, jax.Array) or constant.shape == action_shape:
         return policy

@@ -15,7 +15,7 @@ import platform
 import socket
 import time
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -33,6 +33,7 @@ from rtd3jax.study.loggers import Logger
 from rtd3jax.study.memory_plan import WORKER_BYTES, job_bytes, lanes_at_once, usable_memory
 from rtd3jax.study.plan import Cell, label
 from rtd3jax.study.rundir import PACKAGES, RunDirectory
+from rtd3jax.system.files import user_path
 from rtd3jax.system.imports import import_modules
 from rtd3jax.system.versions import versions_of
 from rtd3jax.training.checkpoint import checkpoint_steps
@@ -77,14 +78,15 @@ def train_on_cluster(
         imports: modules that register environments.
 
     Raises:
-        UserError: when Ray is not installed, there is no cluster, no node has the resources, or a
-            node has other versions or cannot read the run directory.
+        UserError: when a start is a relative path, Ray is not installed, there is no cluster, no
+            node has the resources, or a node has other versions or cannot read the run directory.
     """
     waiting: dict[Cell, list[Job]] = {}
     for job in waiting_jobs(directory, jobs):
         waiting.setdefault(job.cell, []).append(job)
     if not waiting:
         return
+    _check_starts(waiting)
     ray = _ray()
     with _connected(ray, address):
         needs = {cell: _need(members, work, _alive(ray)) for cell, members in waiting.items()}
@@ -107,6 +109,17 @@ def train_on_cluster(
         interim = InterimResults(directory, references, page=work.page)
         log = LogReader(directory, logger)
         _watch(ray, directory, pending, complaints, interim, log, work.quiet)
+
+
+def _check_starts(cells: Iterable[Cell]) -> None:
+    """Raise UserError if the start of a cell is a relative path: a node has another directory."""
+    for cell in cells:
+        start = cell.config.start
+        if start and not user_path(start).is_absolute():
+            raise UserError(
+                f"--start {start} is relative to the directory of this process, which the nodes of "
+                "a cluster do not have: give the absolute path, on the shared storage"
+            )
 
 
 def _alive(ray: ModuleType) -> list[dict]:

@@ -13,8 +13,11 @@ LOG = "log.jsonl"
 def append_rows(path: Path, rows: Iterable[dict[str, Any]]) -> None:
     """Append rows in a single write, so that rows of other processes are not mixed with them."""
     if lines := "".join(json.dumps(row) + "\n" for row in rows):
+        data = lines.encode()
         with path.open("ab", buffering=0) as log:
-            log.write(lines.encode())
+            written = log.write(data)
+            while written < len(data):  # on a disk that is nearly full; the next write raises
+                written += log.write(data[written:])
 
 
 def repair_log(path: Path) -> dict[tuple[Any, ...], Any]:

@@ -76,12 +76,14 @@ class Recorder:
                 self._interim.refresh()
 
     def _log(self, group: Group) -> None:
+        # A worker may be writing the curves and then the step, which is therefore read first.
+        step = group.step
         assert group.returns is not None and group.metrics is not None
         rows = []
         for index, job in enumerate(group.jobs):
             cell, seed = job.key
             curve, steps = group.returns[index], evaluation_steps(cell.config)
-            reached = int(np.sum(steps <= group.step))
+            reached = int(np.sum(steps <= step))
             for k in range(self._logged.get(id(job), 0), reached):
                 lane, value = (
                     {**cell.key, "seed": seed, "step": int(steps[k])},

@@ -78,9 +78,11 @@ def check_starts_stay(cells: Iterable[Cell], out: Path) -> None:
 
 def _place(start: str) -> tuple[Path, str]:
     """The path and the disturbance ("" for any) in the field ``start`` of a configuration."""
-    path, _, disturbance = start.partition("@")
-    directory = user_path(path)
-    return (directory, disturbance) if directory.is_dir() else (user_path(start), "")
+    whole = user_path(start)
+    path, mark, disturbance = start.rpartition("@")
+    if whole.is_dir() or not mark or not user_path(path).is_dir():
+        return whole, ""
+    return user_path(path), disturbance
 
 
 def starts_of(cell: Cell, seeds: Sequence[int]) -> dict[int, Start]:

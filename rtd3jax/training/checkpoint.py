@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rtd3jax.envs.compat.simulated import release
 from rtd3jax.errors import UserError
 from rtd3jax.system.files import read_arrays, write_arrays
 from rtd3jax.system.jax_settings import jax_settings
@@ -308,7 +309,9 @@ def _extended(arrays: dict[str, np.ndarray], program: Program, lane: Lane) -> di
     """Arrays of a lane that has more steps now, extended with the values of a new lane."""
 
     def longer(lane: Lane) -> dict[str, jax.Array]:
-        leaves = jax.tree_util.tree_leaves_with_path(program.init(lane))
+        state = program.init(lane)
+        release(program.env, state.env_state)  # nobody plays the episodes that begin here
+        leaves = jax.tree_util.tree_leaves_with_path(state)
         named = {jax.tree_util.keystr(path): leaf for path, leaf in leaves}
         return {
             name: leaf

@@ -447,8 +447,12 @@ def revived(program: Program, lane: Lane, state: LaneState, step: int) -> LaneSt
     """Restore the simulators of a lane from a checkpoint; if impossible, begin new episodes."""
     env: Any = innermost(program.env)
     simulator = simulator_state(state.env_state)
-    if simulator is None or int(state.failure) != HEALTHY:
+    if simulator is None:
         return state
+    if int(state.failure) != HEALTHY:
+        # Its handles were those of another process, and may be those of other lanes here.
+        none = dataclasses.replace(simulator, handle=jnp.full_like(simulator.handle, -1))
+        return dataclasses.replace(state, env_state=with_simulator(state.env_state, none))
     found = env.restored(simulator)
     if found is not None:
         there = with_simulator(state.env_state, found)

@@ -186,10 +186,11 @@ def train(
         raise UserError(f"config must be an rtd.Config, or several of them, not {config!r}")
     seeds = check_seeds(seeds)
     check_checkpoints(checkpoint_dir, checkpoint_seconds)
-    starts = [_starts(start if start is not None else one.start or None, seeds) for one in configs]
+    sources = [start if start is not None else one.start or None for one in configs]
+    starts = [_starts(source, seeds) for source in sources]
     configs = [
-        dataclasses.replace(one, start=own[seeds[0]].where) if own else one
-        for one, own in zip(configs, starts, strict=True)
+        dataclasses.replace(one, start=_start_field(source, own[seeds[0]])) if own else one
+        for one, source, own in zip(configs, sources, starts, strict=True)
     ]
     jobs = [
         job
@@ -314,6 +315,11 @@ def check_starts(jobs: Iterable[Job], checkpoints: Checkpoints | None) -> None:
     for job in jobs:
         if job.start is not None and not (checkpoints and checkpoints.steps(job)):
             job.start.check(job.program, job.lane)
+
+
+def _start_field(source: StartLike, start: Start) -> str:
+    """The field ``start`` of a configuration: a path that a later training can read, or a name."""
+    return str(user_path(source)) if isinstance(source, str | Path) else start.where
 
 
 def _starts(start: StartLike, seeds: tuple[int, ...]) -> dict[int, Start]:

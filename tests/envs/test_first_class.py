@@ -230,3 +230,16 @@ def test_a_baseline_that_does_not_fit_is_one_line(tank, name, baseline, match):
 def test_ours_stay_whoever_asks(tank, env_id):
     with pytest.raises(rtd.UserError, match="exists already; choose another id"):
         rtd.register(env_id, Tank(), replace=True)
+
+
+class Labelled(Tank):
+    """Declares a number of levels, although it shows a vector."""
+
+    def observation_space(self, params):
+        return spaces.Discrete(4)
+
+
+def test_a_vector_that_is_declared_as_a_number_can_be_disturbed():
+    env = rtd.disturb(Labelled(), rtd.GaussianNoise(sigma=0.1))
+    observation, _ = env.reset(jax.random.key(0), env.default_params)
+    assert env.observation_space().shape == observation.shape == (1,)

@@ -195,6 +195,37 @@ def test_a_flat_constant_action_gets_the_environments_shape():
         assert rtd.robustness(policy, env, ["delay=0"], 1)["return"].item() == 2 * (0 + 1 + 2)
 
 
+def _sum_of_counts(state, observation):
+    return jnp.arange(6.0), state
+
+
+class Scalar(Grid):
+    """Its action is a number."""
+
+    def step_env(self, key, state, action, params):
+        assert action.shape == ()
+        return super().step_env(key, state, jnp.broadcast_to(action, (2, 3)), params)
+
+    def action_space(self, params):
+        return spaces.Box(0.0, 5.0, ())
+
+
+@pytest.mark.parametrize(
+    ("env", "function", "reward"),
+    [
+        (Grid(), _sum_of_counts, 0 + 1 + 2),
+        (Scalar(), lambda state, observation: (2.0, state), 3 * 2.0),
+        (Scalar(), lambda state, observation: (jnp.full(1, 2.0), state), 3 * 2.0),
+    ],
+)
+def test_a_functions_action_gets_the_environments_shape(env, function, reward):
+    policy = rtd.function_policy(function)
+    assert float(rtd.evaluate(policy, env, 1)[0]) == 2 * reward
+    assert float(rtd.rollout(policy, env).returns[0]) == 2 * reward
+    with pytest.raises(rtd.UserError, match=r"action has shape \(4,\)"):
+        rtd.evaluate(rtd.function_policy(lambda state, seen: (jnp.zeros(4), state)), env, 1)
+
+
 class Telling(Pendulum):
     """Reads its angle with an offset, and tells the undisturbed observation."""
 

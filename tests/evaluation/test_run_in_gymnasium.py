@@ -136,3 +136,33 @@ class Broken(gymnasium.Wrapper):
 def test_what_is_not_finite_is_refused_with_its_step(what, match):
     with pytest.raises(UserError, match=match):
         rtd.run_in_gymnasium(Swing(), Broken(what), episodes=1)
+
+
+class Whole(gymnasium.Env):
+    """One step, whose reward is the sum of its actions, which are whole numbers."""
+
+    observation_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    action_space = gymnasium.spaces.Box(-2, 2, (2, 1), np.int32)
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        assert action.dtype == np.int32 and action.shape == (2, 1)
+        return np.zeros(1, np.float32), float(action.sum()), True, False, {}
+
+
+@pytest.mark.parametrize(("action", "total"), [([1.7, -0.6], 1.0), ([9.0, 0.4], 2.0)])
+def test_actions_of_whole_numbers_are_rounded_and_shaped_as_in_training(action, total):
+    constant = rtd.constant_policy(action)
+    function = rtd.function_policy(lambda state, seen: (jnp.asarray(action), state))
+    for policy in (constant, function):
+        np.testing.assert_array_equal(rtd.run_in_gymnasium(policy, Whole(), episodes=2), total)
+    _, state, reward, *_ = _one_step(rtd.from_gymnasium(Whole, max_steps_in_episode=2), action)
+    assert float(reward) == total
+
+
+def _one_step(env, action):
+    params = env.default_params
+    _, state = env.reset(jax.random.key(0), params)
+    return env.step(jax.random.key(1), state, jnp.asarray(action).reshape(2, 1), params)

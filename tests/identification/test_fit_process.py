@@ -280,3 +280,8 @@ def test_slip_of_more_than_two_elements_has_a_picture(tmp_path):
     log = np.random.default_rng(0).uniform(0, 0.5, (3, 40, 4))
     rtd.fit_process(list(log), "ar1").plot(tmp_path / "fit.png")
     assert (tmp_path / "fit.png").stat().st_size > 5_000
+
+
+def test_noise_of_a_log_that_is_zero_after_its_first_value_is_refused():
+    with pytest.raises(rtd.UserError, match="all values except the first are zero"):
+        rtd.fit_process(np.array([1.0] + [0.0] * 20), "noise")

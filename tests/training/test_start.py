@@ -15,7 +15,7 @@ from rtd3jax.agents.freeze import frozen_parts
 from rtd3jax.study import finish
 from rtd3jax.study.execute import checkpoints_of
 from rtd3jax.study.rundir import RunDirectory
-from rtd3jax.study.starts import add_starts, starts_of
+from rtd3jax.study.starts import _place, add_starts, starts_of
 from rtd3jax.system.files import read_arrays, write_arrays
 from rtd3jax.training import lanes
 from rtd3jax.training.run import make_jobs
@@ -171,6 +171,8 @@ def test_each_seed_goes_on_from_its_own_and_with_others_the_same(env, kept):
     assert begun.config.start.startswith("a policy of td3")
     with pytest.raises(rtd.UserError, match="pass this policy again as start="):
         rtd.train(other, begun.config, [0, 1], progress=False)
+    again = rtd.train(other, both.config, [0, 1], progress=False)
+    assert both.config.start == str(directory) and _same(again.policy(1), both.policy(1))
 
 
 @pytest.mark.parametrize(
@@ -321,6 +323,19 @@ def test_a_sweep_goes_on_from_another_and_says_so(tmp_path, monkeypatch, capsys)
     # What is done needs its beginning no more.
     shutil.rmtree(tmp_path / "first")
     assert sweep.main([*begun, "--out", second, "--freeze", "actor.current"]) == 0
+
+
+def test_a_path_may_contain_an_at_sign(tmp_path):
+    plain, marked = tmp_path / "me", tmp_path / "me@host" / "run@1"
+    for directory in (plain, marked):
+        directory.mkdir(parents=True)
+    for start, expected in (
+        (marked, (marked, "")),
+        (f"{marked}@ar1-slip", (marked, "ar1-slip")),
+        (f"{plain}@none", (plain, "none")),
+        (marked / "policy@2.safetensors", (marked / "policy@2.safetensors", "")),
+    ):
+        assert _place(str(start)) == expected
 
 
 def test_what_fresh_moves_away_is_no_start(tmp_path, capsys):

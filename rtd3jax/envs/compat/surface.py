@@ -42,16 +42,23 @@ class Surface:
 
     def command(self, action: np.ndarray) -> np.ndarray:
         """``action`` [A] within the bounds, with the shape and the dtype of the action space."""
-        low, high = self.bounds
-        wide = action.astype(np.float64).reshape(low.shape)
-        within = np.minimum(np.maximum(wide, low), high)
-        if np.issubdtype(self.actions.dtype, np.integer):
-            within = np.rint(within)  # a cast alone would round towards zero
-        return within.astype(self.actions.dtype)
+        return within_bounds(action, *self.bounds, self.actions.dtype)
 
     def seen(self, flat: np.ndarray) -> np.ndarray:
         """The kept elements, float32 [O], of a flat observation."""
         return flat[self.indices].astype(np.float32)
+
+
+def within_bounds(action: np.ndarray, low: np.ndarray, high: np.ndarray, dtype: Any) -> np.ndarray:
+    """``action`` within the bounds (float64), with their shape and the given dtype.
+
+    Elements of a whole dtype are rounded.
+    """
+    wide = action.astype(np.float64).reshape(low.shape)
+    within = np.minimum(np.maximum(wide, low), high)
+    if np.issubdtype(dtype, np.integer):
+        within = np.rint(within)  # a cast alone would round towards zero
+    return within.astype(dtype)
 
 
 def surface_of(

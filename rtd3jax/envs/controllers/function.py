@@ -1,5 +1,7 @@
 """A policy from any function."""
 
+import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -20,13 +22,18 @@ class FunctionPolicy:
 
     state: Any
     function: Callable[[Any, jax.Array], Any] = struct.field(pytree_node=False)
+    shape: tuple[int, ...] | None = struct.field(pytree_node=False, default=None)
+
+    def with_action_shape(self, shape: tuple[int, ...]) -> "FunctionPolicy":
+        """The policy, whose actions get ``shape`` if they have as many elements."""
+        return dataclasses.replace(self, shape=shape)
 
     def init(self, key: jax.Array | None = None) -> Any:
         """The state before the first step of an episode, the same for every episode."""
         return self.state
 
     def step(self, state: Any, observation: jax.Array) -> tuple[jax.Array, Any]:
-        """The function's action [A] and next state."""
+        """The function's action, [A] or of ``shape``, and the next state."""
         name = getattr(self.function, "__name__", type(self.function).__name__)
         try:
             with foreign_code():
@@ -48,13 +55,18 @@ class FunctionPolicy:
             )
         # A loop needs a state of fixed types, but Python numbers in the function may change them.
         after = jax.tree.map(lambda new, old: jnp.asarray(new).astype(old.dtype), after, state)
-        return jnp.atleast_1d(jnp.asarray(action, jnp.float32)), after
+        array = jnp.asarray(action, jnp.float32)
+        if self.shape is None or array.size != math.prod(self.shape):
+            return jnp.atleast_1d(array), after
+        return array.reshape(self.shape), after
 
 
 def function_policy(
     function: Callable[[Any, jax.Array], tuple[Any, Any]], state: object = ()
 ) -> FunctionPolicy:
     """Any function ``(state, observation [O]) -> (action [A], state)`` as a policy.
+
+    Where it plays, its action gets the shape of the environment's actions.
 
     Args:
         function: a pure function in ``jax.numpy``. It is part of the compiled program: define it

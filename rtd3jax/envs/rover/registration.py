@@ -58,7 +58,7 @@ register(
         observation=("speed error", "yaw-rate error"),
         action=("speed", "yaw rate"),
         kind="rover",
-        # The step has no length in seconds; the page states the length that it assumes.
+        # The step has no length in seconds; the page assumes 0.1 s.
         constants=("wheelbase", "target_speed", "target_yaw_rate"),
         hidden=next_slip,
         hidden_name="slip",

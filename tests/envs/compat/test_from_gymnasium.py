@@ -16,6 +16,10 @@ import rtd3jax as rtd
 from rtd3jax.envs.compat.simulator import Fault, Simulator, close_simulators, fault_of
 from rtd3jax.envs.compat.simulator_state import simulator_handles
 from rtd3jax.envs.compat.surface import surface_of
+from rtd3jax.study.time_estimate import study_seconds
+from rtd3jax.training.lanes import make_groups
+from rtd3jax.training.loop import revived
+from rtd3jax.training.run import make_jobs
 
 SMALL = rtd.Config(
     algorithm="td3",
@@ -130,6 +134,20 @@ def test_lanes_train_and_all_simulators_are_closed(strategy):
     np.testing.assert_array_equal(run.returns, again.returns)
 
 
+def test_lanes_with_simulators_train_one_by_one_also_under_vmap():
+    """JAX cannot batch the condition in which an evaluation calls a simulator."""
+    jobs = make_jobs(environment(), SMALL, range(3))
+    groups = make_groups(jobs, "vmap", 1)
+    assert [len(group.jobs) for group in groups] == [1, 1, 1]
+    assert study_seconds(jobs, "vmap", lambda config: 1.0) > 0
+    runs = [
+        rtd.train(environment(), SMALL, seeds=range(3), progress=False, strategy=strategy)
+        for strategy in ("map", "vmap")
+    ]
+    assert not runs[1].failures
+    np.testing.assert_array_equal(runs[0].returns, runs[1].returns)
+
+
 def test_side_by_side_episodes_are_those_one_by_one():
     env = rtd.from_gymnasium("Pendulum-v1")
     policy = rtd.constant_policy([0.5])
@@ -211,11 +229,32 @@ def test_a_free_simulator_stays_open_while_anyone_plays():
     assert fleet.count == 0
 
 
+def test_a_lost_lane_has_no_simulator_of_another_process():
+    (job,) = make_jobs(environment(), SMALL, [0])
+    state = jax.jit(job.program.init)(job.lane)
+    lost = dataclasses.replace(state, failure=jnp.full_like(state.failure, 1))
+    assert simulator_handles(revived(job.program, job.lane, lost, 30).env_state) == [-1]
+    close_simulators()
+
+
+def test_a_lane_that_gets_more_steps_takes_no_simulator(tmp_path):
+    from rtd3jax.training.checkpoint import _extended, to_arrays
+
+    env = environment()
+    (short,) = make_jobs(env, SMALL, [0])
+    longer = dataclasses.replace(SMALL, total_steps=90, replay_capacity=90)
+    (job,) = make_jobs(env, longer, [0])
+    with env.fleet.in_use():
+        state = jax.jit(short.program.init)(short.lane)
+        before = dict(env.fleet._busy)
+        arrays = _extended(to_arrays(state), job.program, job.lane)
+        assert env.fleet._busy == before and len(before) == 1
+    assert len(arrays[".replay.transitions.terminated"]) == 90
+    close_simulators()
+
+
 @pytest.mark.parametrize("noise", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_resumed_lanes_end_with_the_same_bits(tmp_path, noise):
-    from rtd3jax.training.loop import revived
-    from rtd3jax.training.run import make_jobs
-
     (job,) = make_jobs(environment(noise=noise), SMALL, [0])
     program, lane = job.program, job.lane
     advance = jax.jit(program.advance)

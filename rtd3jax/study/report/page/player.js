@@ -194,9 +194,9 @@ const SCENES = {
     };
   },
 
-  // View from above; the rover drives to the right. The step has no length in seconds, so one is assumed.
+  // View from above; the rover drives to the right. If the step has no length in seconds, 0.1 s is assumed.
   rover(entry, run, width) {
-    const step = 0.1;
+    const step = entry.seconds ?? 0.1;
     const { target_speed: speed, target_yaw_rate: turn, wheelbase } = entry.constants;
     const travel = (motion) => {
       const poses = [[0, 0, 0]];
