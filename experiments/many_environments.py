@@ -73,6 +73,7 @@ def main(arguments: list[str] | None = None) -> int:
     differences = many["mean"].to_numpy() - one["mean"].to_numpy()
     mean, low, high = mean_interval(differences)
     share = many["cpu_seconds"].mean() / one["cpu_seconds"].mean()
+    timed = int(table["cpu_seconds"].notna().sum()) // len(COUNTS)
     body = [
         [
             str(count),
@@ -85,7 +86,7 @@ def main(arguments: list[str] | None = None) -> int:
     text = markdown_table(["environments", "return", "CPU seconds a lane", "updates"], body)
     text += (
         f"\n\nDifference of pairs {mean:+.3f} [{low:+.3f}, {high:+.3f}] (95%); "
-        f"{share:.2f} of the processor's time.\n"
+        f"{share:.2f} of the processor's time ({timed} pairs).\n"
     )
     steps = tiny.get("total_steps", ROVER_STEPS)
     write_results(

@@ -6,13 +6,16 @@ Usage: python experiments/pendulum.py [--quick] [--run DIR] [--out DIR] [--steps
 
 The script trains the cells of experiments/pendulum_cells.py that are not in the table yet, as a
 study in DIR. If you repeat the command, also with another DIR, it only trains what is missing from
-the table; with --first-seed 5, further seeds join those of the table. Then it tests each agent
-under its own disturbance, and the agents of `random-sine` under five other conditions, in 1,000
-episodes each. It writes pendulum.md and .parquet, generalisation.md and .parquet,
-pendulum_curves.parquet, and the pictures of experiments/pendulum_figures.py. The paper has five
-seeds, lengths 1 to 20 and width 128; the table states what was run. `--report` does not train: it
-reads all run directories in DIR, also incomplete studies. Other rows of the table do not change;
-rows of earlier settings are marked.
+the table. With --first-seed 5, further seeds join those of the table. They need a DIR of their own,
+because a study trains all of its seeds in all of its cells. With other --steps, give another --out,
+because the claims compare trainings with one number of steps.
+
+Then the script tests each agent under its own disturbance, and the agents of `random-sine` under
+five other conditions, in 1,000 episodes each. It writes pendulum.md and .parquet, generalisation.md
+and .parquet, pendulum_curves.parquet, and the pictures of experiments/pendulum_figures.py. The
+paper has five seeds, lengths 1 to 20 and width 128; the table states what was run. `--report` does
+not train: it reads all run directories in DIR, also incomplete studies. Other rows of the table do
+not change; rows of earlier settings are marked.
 
 Returns are normalised: 0 is the uniform random policy, 1 is the fully observed optimum.
 """
@@ -35,7 +38,14 @@ from rtd3jax.study.transfer import transfer
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from continuing import train_missing  # noqa: E402
-from pendulum_cells import cells, current_setting, in_the_paper, missing, settings_of  # noqa: E402
+from pendulum_cells import (  # noqa: E402
+    CLEAN_NOISE,
+    cells,
+    current_setting,
+    in_the_paper,
+    missing,
+    settings_of,
+)
 from pendulum_figures import draw_all, filter_returns  # noqa: E402
 from settings import mark, notes, setting_text  # noqa: E402
 from writing import (  # noqa: E402
@@ -57,9 +67,14 @@ CONDITIONS = (
 """Conditions for tests of the agents of `random-sine` (the paper's generalisation figure)."""
 LENGTHS = (6, 20, 1, 3, 10)
 """The paper's lengths, in an order that soon gives a useful figure."""
-ALL_DISTURBANCES = (*presets.PENDULUM_DISTURBANCES, *presets.ACTION_HISTORY_DISTURBANCES)
+ALL_DISTURBANCES = (
+    *presets.PENDULUM_DISTURBANCES,
+    *presets.ACTION_HISTORY_DISTURBANCES,
+    CLEAN_NOISE,
+)
 SEEDS = 5
 """The paper's seeds."""
+KEY = ("algorithm", "history_length", "seed")
 TEST_EPISODES = 1_000
 EARLIER_EPISODES = 20
 """The episodes of rows of an old table, which has no column of that name."""
@@ -231,6 +246,8 @@ def report(options: argparse.Namespace, episodes: int, began: float) -> int:
         print(f"nothing is trained in {options.run} yet")
         return 1
     rows = pd.concat(found.values(), ignore_index=True)
+    # Two directories may hold the same training, whose returns are then the same.
+    rows = rows.drop_duplicates([*KEY, "trained_on", "tested_on"], ignore_index=True)
     lanes = rows[rows["trained_on"] == rows["tested_on"]].drop(columns="trained_on")
     lanes = lanes.rename(columns={"tested_on": "disturbance", "true_return": "mean"})
     lanes = with_others(lanes, options.out / "pendulum.parquet", "disturbance")
@@ -241,6 +258,7 @@ def report(options: argparse.Namespace, episodes: int, began: float) -> int:
     about = {**facts(lanes, began), f"trainings_below_{FAILED}": failed(lanes)}
     write_results(options.out, "pendulum", lanes, text, about)
     curves = pd.concat([curves_of(run) for run in found], ignore_index=True)
+    curves = curves.drop_duplicates([*KEY, "disturbance", "step"], ignore_index=True)
     curves_file = options.out / "pendulum_curves.parquet"
     with_others(curves, curves_file, "disturbance").to_parquet(curves_file, index=False)
     print(text)
@@ -258,6 +276,18 @@ def report(options: argparse.Namespace, episodes: int, began: float) -> int:
     return 0
 
 
+def check_seeds_of(run: pathlib.Path, seeds: range) -> None:
+    """End the script if the study in ``run`` has other seeds, which it would also train."""
+    if not (run / "config.json").exists():
+        return
+    others = set(RunDirectory.open(run).seeds) - set(seeds)
+    if others:
+        sys.exit(
+            f"{run} holds other seeds ({min(others)} to {max(others)}), and a study trains all of "
+            "its seeds in all of its cells: choose another --run"
+        )
+
+
 def train(options: argparse.Namespace, tiny: dict[str, object]) -> list[str]:
     """Train the cells missing from the table; return a line for each lane that was lost."""
     path = options.out / "pendulum.parquet"
@@ -267,6 +297,8 @@ def train(options: argparse.Namespace, tiny: dict[str, object]) -> list[str]:
     wanted = cells(options, tiny)
     seeds = range(options.first_seed, options.first_seed + options.seeds)
     todo = missing(wanted, table, seeds)
+    if todo:
+        check_seeds_of(options.run, seeds)
     return train_missing(path, wanted, todo, seeds, options.run, quick=bool(tiny))
 
 
@@ -286,6 +318,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--algorithms", nargs="+", metavar="A", default=list(rtd.ALGORITHMS))
     parser.add_argument("--report", action="store_true", help="no training")
     options = parse(parser, arguments)
+    if options.steps != presets.PENDULUM_STEPS and options.out.resolve() == RESULTS.resolve():
+        parser.error(f"with --steps {options.steps}, choose another --out")
     began, episodes = time.time(), TEST_EPISODES
     tiny: dict[str, object] = {}
     if options.quick:

@@ -32,8 +32,14 @@ HISTORIES = ("lstm-td3", "lstm-td3-no-action")
 """The agents of the paper's figure of action history."""
 
 
+CLEAN_NOISE = "noise:sigma=1.0,reward_from=state"
+"""Noise in the observations alone, beyond the paper: the paper's `noise` also disturbs rewards."""
+
+
 def in_the_paper(disturbance: str, algorithm: str) -> bool:
     """Whether a figure of the paper shows the agent under the disturbance."""
+    if disturbance == CLEAN_NOISE:
+        return False
     return disturbance not in presets.ACTION_HISTORY_DISTURBANCES or algorithm in HISTORIES
 
 

@@ -35,7 +35,7 @@ from writing import RESULTS  # noqa: E402
 
 DISTURBANCES = (*presets.PENDULUM_DISTURBANCES, *presets.ACTION_HISTORY_DISTURBANCES)
 GREY = "#777777"
-NORMALISED = "normalised return\n(1: the fully observed optimum, 0: uniform random actions)"
+NORMALISED = "normalised return\n(1: the fully observed optimum,\n0: uniform random actions)"
 LINES = {0: "#000000", 1: "#56B4E9", 3: "#009E73", 6: "#E69F00", 10: "#D55E00", 20: "#CC79A7"}
 """A colour for each history length; 0 is for agents without a window."""
 

@@ -428,6 +428,12 @@ class Config:
         value: int | None = getattr(self, name)
         return getattr(self, _FOLLOWS[name]) if value is None else value
 
+    @property
+    def words(self) -> str:
+        """The agent and its history length, for messages: ``"h-td3 l=10"``, or ``"td3"``."""
+        length = f" l={self.history_length}" if self.history_length else ""
+        return f"{self.algorithm}{length}"
+
     def to_dict(self) -> dict[str, Any]:
         """The fields as JSON-ready values, with the defaults that depend on other fields."""
         return {**dataclasses.asdict(self), **{name: self._followed(name) for name in _FOLLOWS}}

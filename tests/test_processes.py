@@ -21,7 +21,7 @@ from rtd3jax.study import process_plan, processes
 from rtd3jax.study.crew import Crew
 from rtd3jax.study.lock import is_held
 from rtd3jax.study.log import LOG, read_log
-from rtd3jax.study.plan import Grid, cell_jobs, label, make_cells
+from rtd3jax.study.plan import Grid, cell_jobs, make_cells
 from rtd3jax.study.report import data
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.training.lanes import make_groups
@@ -318,7 +318,9 @@ def test_a_lane_whose_processes_are_all_killed_fails(study):
     assert made.left == 3
     (line,) = complaints
     job = made._lanes[0, 0].jobs[0]
-    assert line.startswith(f"{label(job)} seed 0 failed: 3 processes ended") and "signal 9" in line
+    assert (
+        line.startswith(f"{job.cell.words} seed 0 failed: 3 processes ended") and "signal 9" in line
+    )
     assert "signal 9" in directory.lanes.error_path(*job.key).read_text()
     made.give()
     assert crew.members[0].orders == [[(0, 1)]]  # the other lanes go on

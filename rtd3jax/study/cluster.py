@@ -31,7 +31,7 @@ from rtd3jax.study.lane_files import cell_name
 from rtd3jax.study.log_reader import LogReader
 from rtd3jax.study.loggers import Logger
 from rtd3jax.study.memory_plan import WORKER_BYTES, job_bytes, lanes_at_once, usable_memory
-from rtd3jax.study.plan import Cell, label
+from rtd3jax.study.plan import Cell
 from rtd3jax.study.rundir import PACKAGES, RunDirectory
 from rtd3jax.system.files import user_path
 from rtd3jax.system.imports import import_modules
@@ -100,7 +100,7 @@ def train_on_cluster(
                 "num_gpus": need.gpus,
                 "memory": need.memory,
                 "max_retries": -1,  # Ray repeats a task if its worker dies, not after an error
-                "name": label(members[0]),
+                "name": cell.words,
             }
             path = str(directory.path.resolve())
             index = directory.cells.index(cell)
@@ -182,8 +182,8 @@ def _need(members: Sequence[Job], work: Work, nodes: Sequence[dict]) -> Need:
         if amount > most[name]:
             scale, unit = (2**20, " MiB") if name == "memory" else (1, "")
             raise UserError(
-                f"--cluster: {label(members[0])} needs {amount / scale:,.0f}{unit} {name}, but the "
-                f"largest node has {most[name] / scale:,.0f}{unit}"
+                f"--cluster: {members[0].cell.words} needs {amount / scale:,.0f}{unit} {name}, but "
+                f"the largest node has {most[name] / scale:,.0f}{unit}"
             )
     return need
 
@@ -342,4 +342,4 @@ def _outcome(ray: ModuleType, task: Any, directory: RunDirectory, jobs: Sequence
             cell, seed = job.key
             if not directory.lanes.is_done(cell, seed):
                 directory.lanes.write_error(cell, seed, reason)
-        return [f"{label(jobs[0])} failed: {reason}"]
+        return [f"{jobs[0].cell.words} failed: {reason}"]

@@ -140,21 +140,12 @@ def additions_text(there: Contents, now: Contents) -> str:
         words.append(f"seed{'s' * (len(seeds) > 1)} {_listed(list(map(str, seeds)))}")
     if added:
         one = f"{len(added)} cell{'s' * (len(added) > 1)}"
-        words.append(
-            f"{one} ({_listed([cell_words(cell) for cell in added])}{_unusual(there, added)})"
-        )
+        words.append(f"{one} ({_listed([cell.words for cell in added])}{_unusual(there, added)})")
     for before, after in longer_cells(there, now):
         words.append(
-            f"{after.config.total_steps:,} steps for {before.config.total_steps:,} of "
-            f"{cell_words(after)}"
+            f"{after.config.total_steps:,} steps for {before.config.total_steps:,} of {after.words}"
         )
     return ", ".join(words[:_NAMED] + (["more steps of other cells"] if words[_NAMED:] else []))
-
-
-def cell_words(cell: Cell) -> str:
-    """A cell in a few words."""
-    length = f" l={cell.config.history_length}" if cell.config.history_length else ""
-    return f"{cell.env} {cell.disturbance} {cell.config.algorithm}{length}"
 
 
 def _key(cell: Cell) -> tuple[Any, ...]:

@@ -50,6 +50,11 @@ class Cell:
             "history_length": self.config.history_length,
         }
 
+    @property
+    def words(self) -> str:
+        """The cell in a few words, for messages: ``"rover ar1-slip h-td3 l=10"``."""
+        return f"{self.env} {self.disturbance} {self.config.words}"
+
     def make_env(self) -> Any:
         """The cell's environment."""
         return make(self.env, self.disturbance)
@@ -66,10 +71,8 @@ class Cell:
 
 
 def label(job: Job) -> str:
-    """A job's cell in a few words, for messages."""
-    cell, _ = job.key
-    length = f" l={cell.config.history_length}" if cell.config.history_length else ""
-    return f"{cell.config.algorithm}{length} {cell.disturbance}"
+    """A job's cell without its environment, for the bar, which has little space."""
+    return f"{job.cell.config.words} {job.cell.disturbance}"
 
 
 _OWN_FIELDS = ("env", "disturbance")

@@ -197,5 +197,5 @@ class _Study:
 
     def _fail(self, job: Job, reason: str) -> None:
         self._directory.lanes.write_error(*job.key, reason)
-        self._complaints.append(f"{label(job)} seed {job.seed} failed: {reason}")
+        self._complaints.append(f"{job.cell.words} seed {job.seed} failed: {reason}")
         self.left -= 1

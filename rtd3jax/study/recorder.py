@@ -10,7 +10,6 @@ from rtd3jax.evaluation.returns import both_returns
 from rtd3jax.study.interim import InterimResults
 from rtd3jax.study.log import LOG, append_rows, repair_log
 from rtd3jax.study.loggers import Logger
-from rtd3jax.study.plan import label
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.lanes import Group, Job
@@ -59,7 +58,7 @@ class Recorder:
             for job in group.jobs:
                 cell, seed = job.key
                 self._directory.lanes.write_error(cell, seed, reason)
-                self._complaints.append(f"{label(job)} seed {seed} failed: {reason}")
+                self._complaints.append(f"{cell.words} seed {seed} failed: {reason}")
             return
         self._log(group)
         # An event may arrive after the one at which the group was recorded.
@@ -121,7 +120,7 @@ class Recorder:
             final = np.stack(both_returns(policy, cell.make_env(), self._directory.episodes, seed))
         else:
             self._complaints.append(
-                f"{label(job)} seed {seed} was lost at step {failure.step}: {failure.reason}"
+                f"{cell.words} seed {seed} was lost at step {failure.step}: {failure.reason}"
             )
         self._directory.lanes.write_lane(
             cell,

@@ -19,7 +19,6 @@ from rtd3jax.errors import UserError
 from rtd3jax.study.contents import (
     Contents,
     additions_text,
-    cell_words,
     extended,
     longer_cells,
     read_config,
@@ -240,12 +239,12 @@ class RunDirectory:
                     reason = why_not_longer(before.to_dict(), after.to_dict(), max(kept))
                     if reason is not None:
                         raise UserError(
-                            f"--out {self.path}: {cell_words(after)} cannot continue to {steps:,} "
+                            f"--out {self.path}: {after.words} cannot continue to {steps:,} "
                             f"steps: {reason}; choose another directory"
                         )
             if ended:
                 raise UserError(
-                    f"--out {self.path}: {cell_words(after)} cannot continue to {steps:,} steps: "
+                    f"--out {self.path}: {after.words} cannot continue to {steps:,} steps: "
                     f"{ended} of its lanes ended at {before.config.total_steps:,} without a "
                     "checkpoint (--keep-checkpoints keeps it); choose another directory, or "
                     f"remove {self.path / 'lanes' / cell_name(after)} to train them from the start"

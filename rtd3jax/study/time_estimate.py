@@ -51,7 +51,7 @@ def study_seconds(
     for number, place in enumerate(places, 1):
         own = lanes[executables[place]]
         config = own[0].program.config
-        say(f"timing {number} of {len(places)}: {config.algorithm} l={config.window_tokens}")
+        say(f"timing {number} of {len(places)}: {config.words}")
         width = 1 if advances_alone(own[0], strategy) else -(-len(own) // devices)
         timed[executables[place]] = group_seconds(own[:width])
     whole = _filled_in(executables, timed, operations)

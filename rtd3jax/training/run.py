@@ -213,7 +213,7 @@ def train(
     def label(job: Job) -> str:
         own = configs[job.cell]
         number = "" if single else f" {job.cell}"
-        return f"{own.algorithm} l={own.history_length}{number}"
+        return f"{own.words}{number}"
 
     lanes: dict[tuple[Any, int], tuple[Job, LaneState]] = {}
     with Progress(groups, label, enabled=progress, remark=remark) as bar:

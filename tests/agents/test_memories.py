@@ -151,7 +151,7 @@ class _Fails(_Lag):
         (_Grows, r"step must return a carry like zero's.*float32\[2, 5\]"),
         (_Whole, r"zero\(batch\) must return float32 arrays.*not int32\[2, 5\]"),
         (_Ones, "zero must return zeros"),
-        (_Fails, "failed in step: out of order"),
+        (_Fails, "failed in initial, step or read: out of order"),
     ],
 )
 def test_what_does_not_keep_to_the_interface_is_one_line(module, message):

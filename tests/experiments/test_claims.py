@@ -326,7 +326,7 @@ def test_agents_of_another_condition_are_compared_with_those_trained_under_it():
 
     none = pd.DataFrame()
     for trained, verdict in ((0.6, "supported"), (0.1, "contradicted")):
-        own = rows({claims.HARD_NOISE: trained})
+        own = rows({claims.CLEAN_NOISE: trained, claims.HARD_NOISE: -0.2})
         sides = tables.Trainings(own), none, tables.Trainings(rows(conditions))
         effects = claims.carries_over(tables.Results(none, *sides, none))
         assert claims.combine([effect.verdict() for effect in effects]) == verdict

@@ -242,7 +242,9 @@ def test_the_pendulum_experiment_runs(tmp_path, capsys, monkeypatch):
     assert pendulum.main([*quick, "--run", str(elsewhere)]) == 1
     assert "has 1 of 1 cells" in capsys.readouterr().out and not elsewhere.exists()
 
-    # A further seed joins those of the table.
+    # A further seed joins those of the table. In the study of the others, they would be continued.
+    with pytest.raises(SystemExit, match=r"holds other seeds \(0 to 0\).* choose another --run"):
+        pendulum.main([*quick, "--first-seed", "1", "--run", str(run)])
     assert pendulum.main([*quick, "--first-seed", "1", "--run", str(tmp_path / "further")]) == 0
     assert sorted(pd.read_parquet(out / "pendulum.parquet")["seed"]) == [0, 1]
     capsys.readouterr()
@@ -254,6 +256,15 @@ def test_the_pendulum_experiment_runs(tmp_path, capsys, monkeypatch):
     assert pendulum.main([*quick, *again]) == 1
     assert "missing: trained on random-sine" in capsys.readouterr().out
     (run / "aside").rename(lanes)
+
+    # A training that two directories hold counts once, and only one number of steps is compared.
+    shutil.copytree(run, tmp_path / "both" / "one")
+    shutil.copytree(run, tmp_path / "both" / "two")
+    assert pendulum.main([*quick, "--report", "--run", str(tmp_path / "both")]) == 0
+    assert sorted(pd.read_parquet(out / "pendulum.parquet")["seed"]) == [0, 1]
+    with pytest.raises(SystemExit):
+        pendulum.main(["--steps", "60000", "--report"])
+    assert "with --steps 60000, choose another --out" in capsys.readouterr().err
 
     # Cells of a table from before settings were noted stay, and are marked.
     table.reset_index().drop(columns=["setting", "episodes"]).to_parquet(out / "pendulum.parquet")

@@ -148,7 +148,9 @@ def check_memory(name: str, memory: Memory) -> None:
             f"memory {name!r}: zero must return zeros, which the empty steps of a window are; add "
             "an offset in read instead"
         )
-    params = trace("step", memory.initial, jax.ShapeDtypeStruct((), jax.random.key(0).dtype))
+    params = trace(
+        "initial, step or read", memory.initial, jax.ShapeDtypeStruct((), jax.random.key(0).dtype)
+    )
     token = jax.ShapeDtypeStruct((batch, memory.inputs), jnp.float32)
 
     def apply(params: Params, method: str, *arguments: Any) -> Any:
