@@ -2,6 +2,7 @@
 
 import json
 import math
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -13,10 +14,12 @@ from rtd3jax.agents.variants import ALGORITHMS
 from rtd3jax.cli import sweep_options
 from rtd3jax.config import Config
 from rtd3jax.envs import registry
+from rtd3jax.errors import UserError
 from rtd3jax.study import finish, interim, presets, recorder, references, time_estimate
-from rtd3jax.study.plan import Cell, Grid, make_cells
+from rtd3jax.study.plan import Cell, Grid, bar_label, make_cells
 from rtd3jax.study.presets import PRESETS
 from rtd3jax.study.results import CURVES, EPISODES, read_table
+from rtd3jax.training import lanes
 
 TINY = [
     *("--env", "rover", "--disturbances", "ar1-slip", "--algorithms", "td3", "lstm-td3-1ha1hc"),
@@ -127,6 +130,8 @@ def test_a_lost_lane_is_reported_and_the_exit_status_says_so(tmp_path, capsys):
         ("--preset quick --dry-run --checkpoint-every banana", "'banana' is not like 300s"),
         ("--preset quick --import ./tank.py", "give a module's name: --import tank"),
         ("--preset quick --import=", "--import '': Empty module name"),
+        ("--preset quick --seed 3", "unrecognized arguments: --seed 3"),
+        ("--preset quick --fresh --shard 1/2", "rename it once, then start them without --fresh"),
     ],
 )
 def test_bad_input_is_one_line(arguments, message, capsys, tmp_path):
@@ -152,6 +157,15 @@ def test_dry_run_prints_the_plan(tmp_path, capsys, monkeypatch):
     assert "18 cells × 5 seeds = 90 lanes" in plan and "programs to compile: 18" in plan
     # 75 lanes of two minutes and 15 of td3, which has no window, of one: with two workers.
     assert "MiB" in plan and "time: about 82.5 min" in plan and "timing 4 of 4" in said
+
+
+def test_the_bar_names_environments_only_if_there_are_several():
+    config = Config("lstm-td3", history_length=1)
+    rover, pendulum = (
+        SimpleNamespace(cell=Cell(env, "none", config)) for env in ("rover", "pendulum")
+    )
+    assert bar_label([rover])(rover) == "lstm-td3 l=1 none"
+    assert bar_label([rover, pendulum])(rover) == "rover none lstm-td3 l=1"
 
 
 def test_presets_have_the_papers_cells():
@@ -238,7 +252,7 @@ def test_tables_during_a_study_hold_the_lanes_that_have_ended(tmp_path, monkeypa
     assert rows == [2, 4, 6, 8]  # two evaluations of each lane
 
 
-def _files(directory):
+def _contents(directory):
     return {
         file.relative_to(directory): file.read_bytes()
         for file in directory.rglob("*")
@@ -249,15 +263,28 @@ def _files(directory):
 def test_fresh_keeps_what_was_there(tmp_path, capsys):
     out = tmp_path / "run"
     assert sweep.main([*TINY, "--out", str(out)]) == 0
-    before = _files(out)
+    before = _contents(out)
     changed = [*TINY, "--out", str(out), "--fresh", "--gamma", "0.5"]
     assert sweep.main(changed) == 0
     assert "0.5" in (out / "summary.md").read_text()
-    assert _files(tmp_path / "run.old-1") == before
+    assert _contents(tmp_path / "run.old-1") == before
     changed[-1] = "0.25"
     assert sweep.main(changed) == 0
-    assert _files(tmp_path / "run.old-1") == before
+    assert _contents(tmp_path / "run.old-1") == before
     assert "0.5" in (tmp_path / "run.old-2" / "summary.md").read_text()
+
+
+def test_fresh_does_not_rename_a_link(tmp_path, capsys):
+    out, link = tmp_path / "run", tmp_path / "link"
+    assert sweep.main([*TINY, "--out", str(out)]) == 0
+    link.symlink_to(out)
+    assert sweep.main([*TINY, "--out", str(link), "--fresh"]) == 2
+    assert (
+        f"is a link, and --fresh renames a directory: give --out {out}" in capsys.readouterr().err
+    )
+    assert sweep.main([*TINY, "--out", str(out), "--dry-run"]) == 0
+    plan = capsys.readouterr().out
+    assert "4 of 4 lanes have ended already" in plan and "time:" not in plan
 
 
 def test_fresh_does_not_rename_the_working_directory(tmp_path, monkeypatch, capsys):
@@ -321,7 +348,6 @@ def test_a_second_writer_is_refused_and_a_dead_one_is_not_in_the_way(tmp_path, c
 
 
 def test_a_cell_that_raises_does_not_stop_the_others(tmp_path, monkeypatch, capsys):
-    from rtd3jax.training import lanes
 
     real = lanes._chunk
 
@@ -340,6 +366,36 @@ def test_a_cell_that_raises_does_not_stop_the_others(tmp_path, monkeypatch, caps
     assert "td3, l = 0, seed 1, step ?: failed: the plant" in (out / "summary.md").read_text()
     monkeypatch.setattr(lanes, "_chunk", real)
     assert sweep.main([*TINY, "--out", str(out)]) == 0
+
+
+def test_a_final_evaluation_that_fails_does_not_stop_other_lanes(tmp_path, monkeypatch, capsys):
+    real = recorder.both_returns
+
+    def fails_once(policy, env, episodes, seed):
+        if seed == 1 and policy.algorithm == "td3":
+            raise MemoryError("out of memory")
+        return real(policy, env, episodes, seed)
+
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(recorder, "both_returns", fails_once)
+        assert sweep.main([*TINY, "--out", str(out)]) == 1
+    said = capsys.readouterr().err
+    assert "rover ar1-slip td3 seed 1 failed: its final evaluation: " in said
+    assert "out of memory" in said and len(list(out.glob("lanes/**/*.safetensors"))) == 3
+    monkeypatch.setattr(lanes, "_chunk", lambda *_: pytest.fail("trained again"))
+    assert sweep.main([*TINY, "--out", str(out)]) == 0
+
+
+def test_tables_that_fail_during_a_study_do_not_stop_it(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(interim, "SECONDS", -1.0)
+
+    def derive(*_):
+        raise UserError("a lane is damaged")
+
+    monkeypatch.setattr(interim, "derive", derive)
+    assert sweep.main([*TINY, "--out", str(tmp_path / "run")]) == 0
+    assert capsys.readouterr().err.count("no tables during the training: a lane is damaged") == 1
 
 
 def test_a_full_disk_is_one_line_and_loses_nothing(tmp_path, monkeypatch, capsys):

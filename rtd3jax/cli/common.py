@@ -37,7 +37,9 @@ def exit_status(
         ``interrupted`` returns, after an interrupt; 0 if the reader of the output has ended.
     """
     try:
-        return work()
+        status = work()
+        sys.stdout.flush()  # else the error of a closed pipe comes at the end of the process
+        return status
     except KeyboardInterrupt as interrupt:
         print("interrupted: repeat the command", file=sys.stderr)
         return interrupted(interrupt)
@@ -82,6 +84,7 @@ def run_parser(
         description=description,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog=f"example:\n  python -m rtd3jax.{name} {example}",
+        allow_abbrev=False,
     )
     parser.add_argument("run", help=what)
     add_import(parser)

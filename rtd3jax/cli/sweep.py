@@ -22,7 +22,7 @@ from rtd3jax.cli import sweep_options
 from rtd3jax.cli.common import exit_status
 from rtd3jax.errors import UserError
 from rtd3jax.study.cluster import train_on_cluster
-from rtd3jax.study.execute import Work, train_here
+from rtd3jax.study.execute import Work, train_here, waiting_jobs
 from rtd3jax.study.hosts import own_shard, own_share, relaunch
 from rtd3jax.study.lock import parse_shard, writer
 from rtd3jax.study.loggers import check_loggers
@@ -131,6 +131,11 @@ def _plan(options: argparse.Namespace) -> _Plan:
             "--processes, --shard, --distributed and --cluster each divide the lanes among "
             "processes: choose one of them"
         )
+    if options.fresh and (options.shard or options.distributed):
+        raise UserError(
+            "--fresh renames DIR, which several processes must not do: rename it once, then start "
+            "them without --fresh"
+        )
     out = sweep_options.out(options)
     directory = RunDirectory(out, cells, seeds, episodes)
     if options.fresh and holds_study(out):
@@ -153,7 +158,10 @@ def _dry_run(plan: _Plan, options: argparse.Namespace) -> int:
     """Print the plan."""
     directory, memory = plan.directory, usable_memory()
     say = functools.partial(print, file=sys.stderr, flush=True)
-    print(plan_text(directory.cells, directory.seeds, plan.jobs, plan.strategy, memory, say))
+    jobs = plan.jobs
+    if not options.fresh and not (jobs := waiting_jobs(directory, jobs)):
+        return 0
+    print(plan_text(directory.cells, directory.seeds, jobs, plan.strategy, memory, say))
     if not any(_divided(options)):
         print(f"trained by {plan.shares}")
     print(plan.additions, end="\n" if plan.additions else "")
@@ -247,6 +255,10 @@ def _set_aside(out: Path) -> None:
         raise UserError(
             f"--fresh would rename {out.resolve()}, which is the working directory or holds it: "
             "start the command from outside"
+        )
+    if out.is_symlink():
+        raise UserError(
+            f"{out} is a link, and --fresh renames a directory: give --out {out.resolve()}"
         )
     with writer(out, None):
         for number in range(1, 10_000):

@@ -35,6 +35,7 @@ def parser(description: str | None) -> argparse.ArgumentParser:
         prog="python -m rtd3jax.sweep",
         description=description,
         formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,  # else --seed 3 would be --seeds 3
         epilog=f"disturbances:\n{environments}\n  parameters may follow: noise:sigma=1.0\n"
         "  + combines several: ar1-slip+dropout:p=0.2\n"
         "  / separates alternatives, of which each episode draws one: noise/random-sine\n\n"

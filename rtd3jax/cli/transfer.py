@@ -28,7 +28,9 @@ def _run(options: argparse.Namespace) -> int:
     page = directory.path / NAME
     refresh_page(directory, complete=not page.exists())
     lanes = ["env", "algorithm", "history_length", "trained_on"]
-    means = rows.pivot_table(index=lanes, columns="tested_on", values="return", sort=False)
+    # A mean without its episodes that are not finite would be too high.
+    cells = rows.groupby([*lanes, "tested_on"], sort=False)["return"]
+    means = cells.agg(lambda returns: returns.mean(skipna=False)).unstack(sort=False)
     print(means.round(3).to_string())
     print(f"results: {directory.path / FILE}, {page}")
     return 0

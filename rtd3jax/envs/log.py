@@ -110,6 +110,11 @@ def _episodes_of_table(
     if episode is None and EPISODE in there and EPISODE not in (chosen or ()):
         episode = EPISODE
     if chosen is None:
+        if any(name.startswith("Unnamed: ") for name in there):  # pandas's name for an empty header
+            raise UserError(
+                f"{what} has a column without a name, perhaps the numbers of the rows: choose the "
+                f"elements with columns=[...] (it has: {', '.join(there)})"
+            )
         chosen = [name for name in there if name != episode]
     for name in [*chosen, *([] if episode is None else [episode])]:
         if name not in there:
@@ -129,13 +134,15 @@ def _episodes_of_table(
     if table[episode].isna().any():
         raise UserError(f"{what}: column {episode!r} has empty rows; give every row an episode")
     begins = [0, *(np.flatnonzero(labels[1:] != labels[:-1]) + 1)] if len(labels) else []
-    firsts = [labels[begin] for begin in begins]
-    for place, label in enumerate(firsts):
-        if label in firsts[:place]:
+    seen = set()
+    for place, begin in enumerate(begins):
+        label = labels[begin]
+        if label in seen:
             raise UserError(
                 f"{what}: episode {label} continues in row {begins[place]}, after rows of another "
                 f"episode; sort the rows by {episode!r}"
             )
+        seen.add(label)
     return [values[a:b] for a, b in zip(begins, [*begins[1:], len(values)], strict=True)]
 
 

@@ -38,9 +38,12 @@ def read_policy(path: str | os.PathLike) -> Policy:
     """
     arrays, metadata = read_arrays(path)
     if isinstance(metadata, dict) and "cell" in metadata and "seed" in metadata:
+        parents = Path(path).resolve().parents
+        run = parents[2] if len(parents) > 2 and (parents[2] / "config.json").exists() else None
+        where = "its run directory" if run is None else repr(str(run))
         raise UserError(
             f"{path} is a lane of a run directory, not a saved policy: load it with "
-            f"load_policy({str(Path(path).parents[2])!r}, algorithm=..., seed={metadata['seed']})"
+            f"load_policy({where}, algorithm=..., seed={metadata['seed']})"
         )
     if not isinstance(metadata, dict) or metadata.get("kind") != KIND:
         raise UserError(f"{path} is not a saved policy")

@@ -1,5 +1,6 @@
 """Ceilings of a study's environments, which the run directory stores."""
 
+import contextlib
 import json
 import sys
 from collections.abc import Sequence
@@ -43,7 +44,8 @@ def ceilings_of(
             found[environment] = kept[name]
     if len(kept) > before:
         text = json.dumps({"rtd3jax": version, "ceilings": kept}, indent=1)
-        write_bytes_atomically(path, text.encode())
+        with contextlib.suppress(OSError):  # a directory may be read-only: they are computed again
+            write_bytes_atomically(path, text.encode())
     return found
 
 

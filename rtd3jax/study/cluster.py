@@ -8,6 +8,7 @@ The driver holds the lock of the directory, monitors the tasks, and writes the t
 import contextlib
 import dataclasses
 import importlib
+import itertools
 import json
 import math
 import os
@@ -28,6 +29,7 @@ from rtd3jax.study.derive import Reference
 from rtd3jax.study.execute import Work, train_here, waiting_jobs
 from rtd3jax.study.interim import InterimResults
 from rtd3jax.study.lane_files import cell_name
+from rtd3jax.study.log import TASKS
 from rtd3jax.study.log_reader import LogReader
 from rtd3jax.study.loggers import Logger
 from rtd3jax.study.memory_plan import WORKER_BYTES, job_bytes, lanes_at_once, usable_memory
@@ -39,9 +41,6 @@ from rtd3jax.system.versions import versions_of
 from rtd3jax.training.checkpoint import checkpoint_steps
 from rtd3jax.training.lanes import Job, workers
 
-TASKS = "cluster.jsonl"
-"""File with a JSON line for each task that ended without an error: cell, seeds, node and times, and
-the step from which each lane continued."""
 _POLL_SECONDS = 0.1
 _CONNECT_SECONDS = 10.0
 
@@ -87,6 +86,8 @@ def train_on_cluster(
     if not waiting:
         return
     _check_starts(waiting)
+    for job in itertools.chain.from_iterable(waiting.values()):
+        directory.lanes.error_path(*job.key).unlink(missing_ok=True)
     ray = _ray()
     with _connected(ray, address):
         needs = {cell: _need(members, work, _alive(ray)) for cell, members in waiting.items()}

@@ -8,6 +8,9 @@ from typing import Any
 from rtd3jax.study.results import CELL
 
 LOG = "log.jsonl"
+TASKS = "cluster.jsonl"
+"""File with a JSON line for each task of a cluster that ended without an error: cell, seeds, node
+and times, and the step from which each lane continued."""
 
 
 def append_rows(path: Path, rows: Iterable[dict[str, Any]]) -> None:

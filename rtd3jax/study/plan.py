@@ -70,9 +70,11 @@ class Cell:
         return cls(fields["env"], fields["disturbance"], Config.from_dict(config))
 
 
-def label(job: Job) -> str:
-    """A job's cell without its environment, for the bar, which has little space."""
-    return f"{job.cell.config.words} {job.cell.disturbance}"
+def bar_label(jobs: Iterable[Job]) -> Callable[[Job], str]:
+    """A job's cell in words for the bar of ``jobs``: it has little space for the environment."""
+    if len({job.cell.env for job in jobs}) > 1:
+        return lambda job: job.cell.words
+    return lambda job: f"{job.cell.config.words} {job.cell.disturbance}"
 
 
 _OWN_FIELDS = ("env", "disturbance")
@@ -242,7 +244,9 @@ def plan_text(
     cost = estimate(jobs, strategy, say)
     in_total = lanes_in_total(fit, strategy, count)
     waits = f"; the other {len(jobs) - in_total:,} wait" if in_total < len(jobs) else ""
-    lines = [f"{len(cells)} cells × {len(seeds)} seeds = {len(jobs)} lanes"]
+    whole = len(cells) * len(seeds)
+    left = f", of which {len(jobs)} are left" if len(jobs) < whole else ""
+    lines = [f"{len(cells)} cells × {len(seeds)} seeds = {whole} lanes{left}"]
     for cell in cells:
         config = cell.config
         lines.append(

@@ -54,11 +54,8 @@ class Recorder:
             if id(group) in self._failed:  # an earlier event was handled after the error
                 return
             self._failed.add(id(group))
-            reason = short_reason(group.error)
             for job in group.jobs:
-                cell, seed = job.key
-                self._directory.lanes.write_error(cell, seed, reason)
-                self._complaints.append(f"{cell.words} seed {seed} failed: {reason}")
+                self._note_failure(job, short_reason(group.error))
             return
         self._log(group)
         # An event may arrive after the one at which the group was recorded.
@@ -67,7 +64,14 @@ class Recorder:
                 stays = self._keep_checkpoints and int(state.failure) == HEALTHY
                 if stays:  # first, so that no lane has a file but no checkpoint
                     self._checkpoints.save_lane(job, state, group.step, kept=1)
-                self._keep(job, state)
+                try:
+                    final = self._final_returns(job, state)
+                except Exception as error:  # too many episodes for the memory, for example
+                    self._checkpoints.save_lane(job, state, group.step, kept=1)
+                    reason = f"its final evaluation: {short_reason(error)}"
+                    self._note_failure(job, reason)
+                    continue
+                self._keep(job, state, final)
                 if not stays:
                     self._checkpoints.discard(job)
             group.state = None  # frees the replay
@@ -108,16 +112,27 @@ class Recorder:
             self._logged[id(job)] = reached
         append_rows(self._directory.path / LOG, rows)
 
-    def _keep(self, job: Job, state: LaneState) -> None:
+    def _note_failure(self, job: Job, reason: str) -> None:
+        cell, seed = job.key
+        self._directory.lanes.write_error(cell, seed, reason)
+        self._complaints.append(f"{cell.words} seed {seed} failed: {reason}")
+
+    def _final_returns(self, job: Job, state: LaneState) -> np.ndarray:
+        """Returns, and returns of the undisturbed state, [2, episodes]; NaN if a lane was lost."""
+        (cell, seed), episodes = job.key, self._directory.episodes
+        if int(state.failure) != HEALTHY:
+            return np.full((2, episodes), np.nan, np.float32)
+        policy = job.program.policy(job.lane, state)
+        return np.stack(both_returns(policy, cell.make_env(), episodes, seed))
+
+    def _keep(self, job: Job, state: LaneState, final: np.ndarray) -> None:
         cell, seed = job.key
         failure = failure_of(seed, state)
         returns, true_returns = curves_of(cell.config, state, failure)
-        final = np.full((2, self._directory.episodes), np.nan, np.float32)
         interface = None
         policy = job.program.policy(job.lane, state)
         if failure is None:
             interface = policy.interface()
-            final = np.stack(both_returns(policy, cell.make_env(), self._directory.episodes, seed))
         else:
             self._complaints.append(
                 f"{cell.words} seed {seed} was lost at step {failure.step}: {failure.reason}"

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from rtd3jax.errors import UserError
-from rtd3jax.evaluation.returns import both_returns
+from rtd3jax.evaluation.returns import both_returns, check_counts
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.plants import CheckedEnvironments
 from rtd3jax.study.results import LANE
@@ -51,6 +51,7 @@ def transfer(
         UserError: when no plant could be made with any of the disturbances, or each has changed
             since the study began; when nothing is trained yet; when the table could not be written.
     """
+    check_counts(episodes, 0)
     if write:
         check_writable(directory.path)
     rows: list[dict[str, Any]] = []
@@ -61,7 +62,7 @@ def transfer(
     digest_of = functools.lru_cache(maxsize=len(directory.seeds))(directory.lanes.digest)
     for cell in directory.cells if cells is None else cells:
         own = list(dict.fromkeys(c.disturbance for c in directory.cells if c.env == cell.env))
-        for disturbance in own if tested_on is None else tested_on:
+        for disturbance in own if tested_on is None else dict.fromkeys(tested_on):
             for seed in directory.seeds:
                 try:
                     environments.of(cell)  # the agents must have been trained on this plant

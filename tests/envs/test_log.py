@@ -135,3 +135,11 @@ def test_rows_with_more_cells_than_names_are_refused(rows, tmp_path):
     (tmp_path / "log.csv").write_text(rows)
     with pytest.raises(UserError, match="rows with more cells than its line of column names"):
         read_log(tmp_path / "log.csv")
+
+
+def test_a_column_without_a_name_is_not_taken_for_an_element(tmp_path):
+    pd.DataFrame({"left": [0.1, 0.2], "right": [0.3, 0.1]}).to_csv(tmp_path / "log.csv")
+    with pytest.raises(UserError, match="column without a name.*columns="):
+        read_log(tmp_path / "log.csv")
+    (episode,) = read_log(tmp_path / "log.csv", columns=["left", "right"])
+    np.testing.assert_array_equal(episode, [[0.1, 0.3], [0.2, 0.1]])

@@ -2,6 +2,7 @@
 
 import importlib.util
 import pathlib
+import sys
 
 import jax
 import pytest
@@ -10,6 +11,8 @@ EXPERIMENTS = pathlib.Path(__file__).parents[2] / "experiments"
 
 
 def load(path):
+    if str(EXPERIMENTS) not in sys.path:  # as when a script of this directory is started
+        sys.path.insert(0, str(EXPERIMENTS))
     spec = importlib.util.spec_from_file_location(path.stem, path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)

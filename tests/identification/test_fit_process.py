@@ -285,3 +285,8 @@ def test_slip_of_more_than_two_elements_has_a_picture(tmp_path):
 def test_noise_of_a_log_that_is_zero_after_its_first_value_is_refused():
     with pytest.raises(rtd.UserError, match="all values except the first are zero"):
         rtd.fit_process(np.array([1.0] + [0.0] * 20), "noise")
+
+
+def test_slip_without_a_random_part_is_refused():
+    with pytest.raises(rtd.UserError, match="ar1: the log has no random part"):
+        rtd.fit_process([np.full((50, 1), 0.2), np.full((50, 1), 0.3)], "ar1")

@@ -55,7 +55,8 @@ def rows_of(table, key):
 
 def test_the_numbers_are_those_of_the_tables(runs):
     data = data_of(runs["rover"])
-    assert data["notes"] == [] and data["status"] == {"done": 12}
+    assert data["notes"] == [] and data["status"] == {"done": 12} and data["played"]
+    assert all(cell["statuses"] == {"done": 2} for cell in data["cells"])
     episodes = pd.read_parquet(runs["rover"] / "episodes.parquet")
     curves = pd.read_parquet(runs["rover"] / "curves.parquet")
     for cell in data["cells"]:
@@ -177,6 +178,36 @@ def test_an_unfinished_run_has_a_page_that_says_so(runs, tmp_path, monkeypatch):
     assert data["status"] == {"planned": 12}
     assert data["notes"][0] == "no lane has ended yet"
     assert data["transfer"] is None and data["playback"] == []
+    assert all(cell["statuses"] == {"planned": 2} for cell in data["cells"])
+    directory = RunDirectory.open(hostile)
+    cell = directory.cells[0]
+    directory.lanes.write_error(cell, 0, "the plant is on fire")
+    (hostile / "cluster.jsonl").touch()
+    row = {**cell.key, "seed": 1, "step": 20, "return": -1.0, "seconds": 3.0}
+    (hostile / "log.jsonl").write_text(json.dumps(row) + "\n")
+    data = page_data(directory, complete=True, playback=False)
+    assert data["cells"][0]["statuses"]["failed"] == 1 and not data["played"]
+    assert data["timing"] == {"steps": 20, "shards": 0}  # each task has a clock of its own
+
+
+def test_a_lane_that_was_copied_from_its_run_is_named(runs, tmp_path):
+    directory = RunDirectory.open(runs["rover"])
+    own = directory.lanes.lane_path(directory.cells[0], 0)
+    with pytest.raises(rtd.UserError, match=rf"load_policy\('{runs['rover']}', algorithm"):
+        rtd.load_policy(own)
+    shutil.copy(own, tmp_path / "alone.safetensors")
+    with pytest.raises(rtd.UserError, match=r"load_policy\(its run directory, algorithm"):
+        rtd.load_policy(tmp_path / "alone.safetensors")
+
+
+def test_an_agent_without_a_mean_has_none_in_the_printed_table(runs, monkeypatch, capsys):
+    rows = pd.DataFrame({"env": "rover", "algorithm": ["td3", "td3", "h-td3"], "history_length": 0})
+    rows = rows.assign(trained_on="none", tested_on="a", **{"return": [1.0, np.nan, -2.5]})
+    monkeypatch.setattr("rtd3jax.cli.transfer.transfer", lambda *_: rows)
+    monkeypatch.setattr("rtd3jax.cli.transfer.refresh_page", lambda *_, **__: None)
+    assert transfer.main([str(runs["rover"])]) == 0
+    td3, h_td3 = re.findall(r"td3 +0 +none +(\S+)", capsys.readouterr().out)
+    assert (td3, h_td3) == ("NaN", "-2.5")
 
 
 def test_returns_of_policies_that_were_trained_further_are_left_out(runs, tmp_path):
@@ -226,5 +257,7 @@ def test_transfer_names_what_does_not_fit(runs, capsys):
     assert transfer.main([run, "--on", "hidden", "--episodes", "1"]) == 2
     captured = capsys.readouterr()
     assert "3 observation elements" in captured.out and "no policy in" in captured.err
+    assert transfer.main([run, "--episodes", "0"]) == 2
+    assert "episodes must be an integer of at least 1" in capsys.readouterr().err
     assert transfer.main([run, "--on", "nose"]) == 2
     assert "did you mean 'noise'" in capsys.readouterr().err

@@ -63,6 +63,17 @@ def test_commands_end_in_one_line_after_an_interrupt_or_a_closed_pipe(capsys, mo
     assert common.exit_status(broken, lambda: "run") == 0
     assert redirected and capsys.readouterr().err == ""
 
+    class Closed(io.StringIO):  # what is in its buffer cannot be written
+        def flush(self):
+            raise BrokenPipeError(32, "Broken pipe")
+
+        def fileno(self):
+            return 1
+
+    redirected.clear()
+    monkeypatch.setattr(common.sys, "stdout", Closed())
+    assert common.exit_status(lambda: 7, lambda: "run") == 0 and redirected
+
 
 def test_the_last_line_of_a_traceback_says_most():
     from rtd3jax.errors import short_reason

@@ -8,7 +8,7 @@ import dataclasses
 import json
 import math
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping
 from typing import Any
 
@@ -18,7 +18,7 @@ import pandas as pd
 from rtd3jax.config import Config
 from rtd3jax.errors import UserError
 from rtd3jax.study.colours import colour_of, ordered
-from rtd3jax.study.log import LOG, lane_of, read_log, steps_reached
+from rtd3jax.study.log import LOG, TASKS, lane_of, read_log, steps_reached
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.results import CELL, is_trained, reference_names, rounded_number
 from rtd3jax.study.rundir import RunDirectory
@@ -51,9 +51,9 @@ def study_data(
     algorithms = ordered(cell.config.algorithm for cell in directory.cells)
     measures = [m for m in MEASURES if m == "return" or _differs(curves, episodes)]
     ledger = _ledger(directory, notes)
-    begun = Counter(
-        tuple(row[name] for name in CELL) for row in ledger if row["status"] != "planned"
-    )
+    statuses: dict[tuple[object, ...], Counter[str]] = defaultdict(Counter)
+    for row in ledger:
+        statuses[tuple(row[name] for name in CELL)][row["status"]] += 1
     return {
         "title": directory.path.resolve().name,
         "metrics": sorted(metrics["metric"].unique()),
@@ -81,7 +81,7 @@ def study_data(
                 "agent": algorithms.index(cell.config.algorithm),
                 "length": cell.config.history_length,
                 "seeds": len(directory.seeds),
-                "begun": begun[tuple(cell.key[name] for name in CELL)],
+                "statuses": dict(statuses[tuple(cell.key.values())]),
                 "curves": {m: curve_data(rows_of(curves, cell), m, "step") for m in measures},
                 "learning": _learning(rows_of(metrics, cell)),
                 "final": {m: _final(rows_of(lanes, cell), m) for m in measures},
@@ -234,8 +234,8 @@ _SWAPPED = 0.1
 def _timing(rows: list[dict[str, Any]], directory: RunDirectory) -> dict[str, Any] | None:
     """Times from the log; the clock starts at zero in each session.
 
-    If several shards write the log at the same time, each with its own clock, the sum of their
-    times has no meaning and is left out.
+    If several shards or tasks of a cluster write the log at the same time, each with its own clock,
+    the sum of their times has no meaning and is left out. The number of shards is 0 for a cluster.
     """
     stamps = [row.get("seconds") for row in rows]
     if not rows or not all(isinstance(stamp, int | float) for stamp in stamps):
@@ -246,6 +246,8 @@ def _timing(rows: list[dict[str, Any]], directory: RunDirectory) -> dict[str, An
     ]
     if shards:
         return {"steps": steps, "shards": len(shards)}
+    if (directory.path / TASKS).exists():  # each task of a cluster has its own clock, too
+        return {"steps": steps, "shards": 0}
     following = [*stamps[1:], -1.0]
     ends = [a for a, b in zip(stamps, following, strict=True) if a is not None and b < a - _SWAPPED]
     seconds = sum(ends)

@@ -5,6 +5,7 @@ the action, the reward, and the hidden variable, if the environment provides it.
 """
 
 import base64
+import contextlib
 import dataclasses
 import json
 from collections.abc import Callable
@@ -65,7 +66,8 @@ def recordings(
             except UserError as error:
                 problems.setdefault(str(error), []).append(f"{cell_name(cell)} {path.stem}")
                 continue
-            write_bytes_atomically(path, json.dumps(kept).encode())
+            with contextlib.suppress(OSError):  # the run may be read-only: recorded again next time
+                write_bytes_atomically(path, json.dumps(kept).encode())
         if kept is not None:
             shown = {name: value for name, value in kept.items() if name not in stamp}
             found.append({"cell": index, "seed": seed, **shown})

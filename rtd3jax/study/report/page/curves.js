@@ -9,9 +9,11 @@ function curvePanels() {
     const references = referencesOf(environment, state.measure);
     const curves = cells.map((cell) => cell.curves[state.measure]).filter(Boolean);
     // The same range for all lengths of an environment, so that its panels can be compared. Early returns
-    // may be a hundred times lower than late returns: the lowest tenth of a curve's points may be cut off.
+    // may be a hundred times lower than late returns: the lowest tenth of all points may be cut off.
     const lows = curves.flatMap((curve) => curve.low.map((low, k) => (finite(low) ? low : curve.iqm[k])));
-    const floor = quantile(lows, 0.1);
+    // No curve ends below the panel, however few of the points are its own.
+    const ends = curves.map((curve) => curve.iqm.filter(finite).pop()).filter(finite);
+    const floor = lowest([quantile(lows, 0.1), ...ends]);
     const kept = curves.flatMap((curve) => [...curve.low, ...curve.high, ...curve.iqm]).filter((value) => value >= floor);
     const range = { ...limits(kept, references), cut: lowest(lows.filter(finite)) < floor };
     for (const length of lengths.length ? lengths : [0]) {

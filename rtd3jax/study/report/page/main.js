@@ -16,7 +16,7 @@ function lede() {
   byId('footer').textContent = `Written ${DATA.written} by rtd3jax ${DATA.rtd3jax}.`;
 }
 
-const textOf = (value) => (value === null ? DASH : typeof value === 'number' ? compact(value) : String(value));
+const textOf = (value) => (value === null ? DASH : Number.isInteger(value) ? value.toLocaleString('en') : typeof value === 'number' ? compact(value) : String(value));
 
 function drawStudy() {
   const { settings } = DATA.study;
@@ -34,7 +34,7 @@ const pairs = (list) => el('table', { class: 'data wrap' }, el('tbody', {}, list
 function timing() {
   const time = DATA.timing;
   if (!time) return el('p', { class: 'missing' }, 'The run has no log with times.');
-  if (time.shards) return pairs([['environment steps', compact(time.steps)], ['shards', `${time.shards}, each with its own clock`]]);
+  if (time.shards !== undefined) return pairs([['environment steps', compact(time.steps)], time.shards ? ['shards', `${time.shards}, each with its own clock`] : ['cluster', 'each task with its own clock']]);
   return pairs([['environment steps', compact(time.steps)], ['total time', duration(time.seconds)],
     ['sessions', String(time.sessions)], ['steps per second', time.steps_per_second ? compact(Math.round(time.steps_per_second)) : DASH]]);
 }
@@ -47,9 +47,9 @@ function madeWith() {
 
 function troubles() {
   if (!DATA.troubles.length) return [];
-  const rows = DATA.troubles.map((row) => [`${row.disturbance}, ${row.algorithm}, history ${row.history_length}, seed ${row.seed}`,
+  const rows = DATA.troubles.map((row) => [`${row.env}, ${row.disturbance}, ${row.algorithm}, history ${row.history_length}, seed ${row.seed}`,
     `${row.status} at step ${row.step.toLocaleString('en')}${row.reason ? `: ${row.reason}` : ''}`]);
-  return [el('h3', {}, 'Lanes that have not ended'), pairs(rows)];
+  return [el('h3', {}, 'Lanes that are not done'), pairs(rows)];
 }
 
 function redraw() {

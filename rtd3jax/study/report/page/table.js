@@ -33,7 +33,11 @@ function stateOf(cell) {
   const lost = final && final.lost ? `, ${final.lost} lost` : '';
   const ended = final ? final.n + final.lost : 0;
   if (ended === cell.seeds) return `done${lost}`;
-  return cell.begun ? `under way${lost}` : 'planned';
+  // The states as --status prints them; an ended lane may not be in the tables yet.
+  const { planned = 0, failed = 0, ...others } = cell.statuses;
+  const parts = failed ? [`${failed} failed`] : [];
+  if (Object.values(others).some(Boolean)) parts.unshift('under way');
+  return `${parts.join(', ') || 'planned'}${lost}`;
 }
 
 function tableRows() {

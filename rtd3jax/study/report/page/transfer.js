@@ -9,7 +9,7 @@ function drawTransfer() {
     body.replaceChildren(el('p', { class: 'missing' }, 'python -m rtd3jax.transfer RUN tests them and draws this matrix.'));
     return;
   }
-  about.textContent = 'Mean return over seeds (± their standard deviation) of agents trained under one disturbance and tested under another. Within a column, darker is better.';
+  about.textContent = 'Mean return as rewarded, over seeds (± their standard deviation), of agents trained under one disturbance and tested under another. Within a column, a stronger colour is better.';
   const chosen = new Set([...state.agents].map((index) => DATA.agents[index].name));
   const blocks = [];
   for (const env of [...new Set(DATA.transfer.map((entry) => entry.env))]) {
