@@ -33,6 +33,7 @@ from rtd3jax.study.presets import PRESETS
 from rtd3jax.study.presets import ROVER_HISTORY_LENGTH as HISTORY_LENGTH
 from rtd3jax.study.presets import ROVER_SETTINGS as SETTINGS
 from rtd3jax.study.presets import ROVER_STEPS as STEPS
+from rtd3jax.study.rundir import RunDirectory
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 import continuing  # noqa: E402
@@ -88,6 +89,16 @@ def train(run: pathlib.Path, steps: int, tiny: dict[str, object]) -> list[str]:
     return continuing.train(cells, range(1 if tiny else SEEDS), run, quick=bool(tiny))
 
 
+@functools.cache
+def own_setting(run: pathlib.Path, algorithm: str, disturbance: str) -> str:
+    """The settings with which a run trained the agent, as the text in tables."""
+    wanted = {"algorithm": algorithm, "disturbance": disturbance}
+    (config,) = [
+        cell.config for cell in RunDirectory.open(run).cells if wanted.items() <= cell.key.items()
+    ]
+    return setting_text({name: getattr(config, name) for name in (*SETTINGS, "total_steps")})
+
+
 def evaluate_policies(run: pathlib.Path, episodes: int, known: pd.DataFrame | None, setting: str):
     """A row per lane and process: the mean over ``episodes``, and over the paper's twenty.
 
@@ -108,9 +119,8 @@ def evaluate_policies(run: pathlib.Path, episodes: int, known: pd.DataFrame | No
                     rows.append(row)
                     continue
                 try:
-                    policy = rtd.load_policy(
-                        run, algorithm=algorithm, disturbance=trained, seed=seed
-                    )
+                    key = {"algorithm": algorithm, "disturbance": trained}
+                    policy = rtd.load_policy(run, **key, seed=seed)
                 except rtd.UserError as error:
                     if row is None:
                         missing.append(str(error))
@@ -127,7 +137,7 @@ def evaluate_policies(run: pathlib.Path, episodes: int, known: pd.DataFrame | No
                         "episodes": episodes,
                         **continuing.mean_and_error(returns),
                         "mean_of_20": float(returns[: continuing.FINAL_EPISODES].mean()),
-                        "setting": setting,
+                        "setting": own_setting(run, **key),
                     }
                 )
     return pd.DataFrame(rows), sorted(set(missing))
@@ -286,7 +296,8 @@ def main(arguments: list[str] | None = None) -> int:
             print(line, file=sys.stderr)
     kept = options.out / "rover.parquet"
     known = pd.read_parquet(kept) if options.report and kept.exists() else None
-    setting = setting_text({**SETTINGS, "total_steps": steps})
+    now = {**SETTINGS, "total_steps": steps}
+    setting = setting_text({name: tiny.get(name, value) for name, value in now.items()})
     rows, missing = evaluate_policies(options.run, episodes, known, setting)
     if rows.empty:
         print(f"nothing is trained in {options.run} yet")

@@ -30,15 +30,17 @@ def test_the_rover_experiment_runs_and_says_what_is_missing(tmp_path, capsys):
     assert "-1.36 ± 0.04" in (out / "rover.md").read_text()
 
     # What another setting gave stays where this one gave nothing, and is marked.
+    now = table["setting"][0]  # which the run's configuration says
+    assert now.endswith("--total-steps=60")
     earlier = table.assign(setting="--earlier", mean=-9.0)
     known = pd.concat([earlier, earlier.assign(algorithm="h-td3")])
-    rows, _ = rover.evaluate_policies(run, 20, known, "--now")
+    rows, _ = rover.evaluate_policies(run, 20, known, now)
     means = rows.set_index("algorithm")["mean"]
     assert means["td3"] == table["mean"][0] and means["h-td3"] == -9.0
     others = {"ceiling": dict.fromkeys((tested for _, tested in rover.COLUMNS), "0")}
-    text = rover.table(rows, others, "--now")
+    text = rover.table(rows, others, now)
     assert "-9.00 (1 of 5 seeds) †" in text and text.endswith("† trained with --earlier")
-    again, _ = rover.evaluate_policies(tmp_path / "nothing", 20, rows, "--now")
+    again, _ = rover.evaluate_policies(tmp_path / "nothing", 20, rows, now)
     pd.testing.assert_frame_equal(again, rows)
 
     pictures = load(EXPERIMENTS / "rover_pictures.py")
