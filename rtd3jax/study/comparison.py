@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from rtd3jax.errors import UserError
+from rtd3jax.study.plants import differing_plants
 from rtd3jax.study.results import CELL, is_trained
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.statistics import compare, seed_means, summarise
@@ -68,7 +69,7 @@ def compare_runs(
 def differing_settings(
     directories: Sequence[RunDirectory], names: Sequence[str], table: pd.DataFrame
 ) -> list[str]:
-    """A line of text for each setting in which runs differ in the cells of ``table``."""
+    """A text for each setting, and each plant, in which runs differ in the cells of ``table``."""
     wanted = set(table[list(CELL)].itertuples(index=False, name=None))
     found: dict[str, dict[str, list[str]]] = {}
     for name, directory in zip(names, directories, strict=True):
@@ -80,7 +81,16 @@ def differing_settings(
                 }.items():
                     values = found.setdefault(field, {}).setdefault(name, [])
                     values += [str(value)] if str(value) not in values else []
-    return [
+    plants = [directory.known_plants() for directory in directories]
+    # Names of plants begin as the cells' columns: the environment, then the disturbance.
+    shown = {f"{env} {disturbance}" for env, disturbance, *_ in wanted}
+    first = {name: plant for name, plant in plants[0].items() if name in shown}
+    changed = [
+        f"plant of {names[0]} (there) and {name} (here): {text}"
+        for name, own in zip(names[1:], plants[1:], strict=True)
+        for text in differing_plants(first, own)
+    ]
+    return changed + [
         f"{field}: " + ", ".join(f"{' or '.join(own)} ({name})" for name, own in values.items())
         for field, values in found.items()
         if len({tuple(own) for own in values.values()}) > 1 and field not in CELL

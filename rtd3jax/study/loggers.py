@@ -16,7 +16,6 @@ import importlib.util
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 from rtd3jax.errors import UserError, short_reason
@@ -48,6 +47,7 @@ class PerLane(abc.ABC, Generic[Run]):
 
     def __init__(self, directory: RunDirectory) -> None:
         self._path = directory.path
+        self._study = directory.identity()
         self._runs: dict[tuple[str, int], Run] = {}
 
     def log(self, cell: Cell, seed: int, row: dict[str, Any]) -> None:
@@ -138,7 +138,7 @@ class WandB(PerLane[WandBRun]):
         name = cell_name(cell)
         run = self._wandb.init(
             project=os.environ.get("WANDB_PROJECT", self._path.resolve().name),
-            id=_lane_id(self._path, name, seed),
+            id=_lane_id(self._study, name, seed),
             mode=self._mode,
             resume="allow",
             reinit="create_new",
@@ -171,7 +171,7 @@ class MLflow(PerLane[str]):
         self._experiment = found.experiment_id if found else self._client.create_experiment(name)
 
     def _begin(self, cell: Cell, seed: int) -> str:
-        lane = _lane_id(self._path, cell_name(cell), seed)
+        lane = _lane_id(self._study, cell_name(cell), seed)
         query = f"tags.lane = '{lane}'"
         for run in self._client.search_runs([self._experiment], query, max_results=1):
             return run.info.run_id
@@ -268,7 +268,7 @@ def open_loggers(names: Sequence[str], directory: RunDirectory) -> Iterator[Logg
         logger.close()
 
 
-def _lane_id(path: Path, cell: str, seed: int) -> str:
+def _lane_id(study: str, cell: str, seed: int) -> str:
     """The unique id of a lane, the same after each restart of its study."""
-    text = f"{path.resolve()}\n{cell}\n{seed}"
+    text = f"{study}\n{cell}\n{seed}"
     return hashlib.sha256(text.encode()).hexdigest()[:24]

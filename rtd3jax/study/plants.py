@@ -66,6 +66,19 @@ def check_plants(path: Path, before: Plants, now: Plants) -> list[str]:
     return lines
 
 
+def differing_plants(before: Plants, now: Plants) -> list[str]:
+    """A text for each plant that both have, and that is not the same in both."""
+    found = []
+    for name in before.keys() & now.keys():
+        there, plant = before[name], now[name]
+        compared = plant.keys() & there.keys() - {CODE, NAMES}
+        if any(not same(there[part], plant[part]) for part in compared):
+            found.append(f"{name} ({_difference(there, plant, compared)})")
+        elif is_other_code(there.get(CODE), plant.get(CODE)):
+            found.append(f"{name} (its code)")
+    return sorted(found)
+
+
 class CheckedEnvironments:
     """Makes the environments of a study's cells; each plant is compared with the study once.
 

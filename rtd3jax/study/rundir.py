@@ -7,6 +7,7 @@ The directory holds the configuration (this module), a file for each lane (`lane
 import json
 import platform
 import time
+import uuid
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -137,9 +138,20 @@ class RunDirectory:
             )
         return "\n".join(news)
 
+    def known_plants(self) -> Plants:
+        """The plants with which the study was begun or extended; none in an earlier version."""
+        return read_config(self.path / CONFIG).get("plants", {})
+
+    def identity(self) -> str:
+        """A text that no other study has, also if it was here before, or is a copy.
+
+        It is the path alone if an earlier version began the study.
+        """
+        return read_config(self.path / CONFIG).get("id", "") + str(self.path.resolve())
+
     def check_plants(self, now: Plants) -> list[str]:
         """Lines about changed plants of this study; `rtd3jax.study.plants.check_plants`."""
-        return check_plants(self.path, read_config(self.path / CONFIG).get("plants", {}), now)
+        return check_plants(self.path, self.known_plants(), now)
 
     def prepare(self) -> str:
         """Create the directory, or extend its study; return the message of `plan`.
@@ -185,6 +197,7 @@ class RunDirectory:
             made_with, plants = _made_with(), self._plants(self.contents.cells)
             new = {
                 "format": CONFIG_FORMAT,
+                "id": uuid.uuid4().hex,
                 "study": study,
                 "plants": plants,
                 "made_with": made_with,

@@ -13,6 +13,7 @@ from rtd3jax import compare as command
 from rtd3jax.study.comparison import compare_runs
 from rtd3jax.study.derive import derive
 from rtd3jax.study.plan import Grid, make_cells
+from rtd3jax.study.plants import differing_plants
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.statistics import compare
 
@@ -104,6 +105,15 @@ def test_the_command_prints_and_keeps_the_table(runs, tmp_path, capsys):
     assert table["mean"].tolist() == [1.0, 2.0] and np.isnan(table["difference"][0])
     assert command.main([runs["before"], runs["after"], "--true-return"]) == 0
     assert "| td3 | 0 | a/run | 3 | 11 [10, 12] |" in capsys.readouterr().out
+
+
+def test_runs_of_another_plant_with_the_same_name_differ():
+    plant = {"params": [1.0, 9.8], "names": ["mass", "g"], "actions": 1, "code": None}
+    before = {"own none": plant, "own noise": plant}
+    now = {"own none": {**plant, "params": [2.0, 9.8]}, "own delay": plant}
+    assert differing_plants(before, before) == []
+    (text,) = differing_plants(before, now)
+    assert text == "own none (mass: 1.0 there, 2.0 here)"
 
 
 def test_the_first_run_is_what_others_are_compared_with(runs):

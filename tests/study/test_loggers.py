@@ -218,3 +218,12 @@ def test_wandb_is_offline_unless_asked(directory, monkeypatch):
     monkeypatch.setenv("WANDB_MODE", "online")
     with pytest.raises(UserError, match="run wandb login"), open_loggers(["wandb"], directory):
         pass
+
+
+def test_a_study_that_begins_anew_in_the_same_place_has_new_ids(directory):
+    first = directory.identity()
+    assert RunDirectory.open(directory.path).identity() == first
+    (directory.path / "config.json").unlink()
+    anew = RunDirectory.create(directory.path, directory.cells, [0, 1], 2)
+    assert anew.identity() != first
+    assert anew.identity().endswith(str(directory.path.resolve()))

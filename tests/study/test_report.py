@@ -184,10 +184,12 @@ def test_an_unfinished_run_has_a_page_that_says_so(runs, tmp_path, monkeypatch):
     directory.lanes.write_error(cell, 0, "the plant is on fire")
     (hostile / "cluster.jsonl").touch()
     row = {**cell.key, "seed": 1, "step": 20, "return": -1.0, "seconds": 3.0}
-    (hostile / "log.jsonl").write_text(json.dumps(row) + "\n")
+    earlier = {**row, "step": 60, "return": 5.0}  # before the lane was trained again
+    (hostile / "log.jsonl").write_text("".join(json.dumps(one) + "\n" for one in (earlier, row)))
     data = page_data(directory, complete=True, playback=False)
     assert data["cells"][0]["statuses"]["failed"] == 1 and not data["played"]
     assert data["timing"] == {"steps": 20, "shards": 0}  # each task has a clock of its own
+    assert data["cells"][0]["curves"]["return"]["steps"] == [20]
 
 
 def test_a_lane_that_was_copied_from_its_run_is_named(runs, tmp_path):

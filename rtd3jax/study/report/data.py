@@ -103,17 +103,18 @@ def _with_log(
     key = [*CELL, "seed"]
     kept = set(curves[key].itertuples(index=False, name=None))
     study = {(*cell.key.values(), seed) for cell in directory.cells for seed in directory.seeds}
-    rows: dict[tuple, dict[str, Any]] = {}
+    rows: dict[tuple, dict[int, dict[str, Any]]] = defaultdict(dict)
     for row in log:
         lane = lane_of(row)
         value = row.get("return")
         if lane in study and lane not in kept and isinstance(value, float | int):
-            # A lane that was trained again is logged again; the last row is valid.
+            # A lane that is trained again is logged again: its later rows are of no use then.
+            for step in [step for step in rows[lane] if step > row["step"]]:
+                del rows[lane][step]
             point = {name: row[name] for name in (*key, "step")}
-            rows[*lane, row["step"]] = {**point, "return": value, "true_return": math.nan}
-    if not rows:
-        return curves
-    return pd.concat([curves, pd.DataFrame(list(rows.values()))[curves.columns]])
+            rows[lane][row["step"]] = {**point, "return": value, "true_return": math.nan}
+    points = [point for own in rows.values() for point in own.values()]
+    return pd.concat([curves, pd.DataFrame(points)[curves.columns]]) if points else curves
 
 
 def _differs(curves: pd.DataFrame, episodes: pd.DataFrame) -> bool:
