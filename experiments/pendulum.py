@@ -238,6 +238,14 @@ def curves_of(run: pathlib.Path) -> pd.DataFrame:
     return kept[names].assign(setting=settings)
 
 
+def once(rows: pd.DataFrame, key: list[str], settings: list[str]) -> pd.DataFrame:
+    """``rows`` without repetitions; the script ends if a training has two ``settings``."""
+    rows = rows.drop_duplicates([*key, *settings], ignore_index=True)
+    if rows.duplicated(key).any():
+        sys.exit(f"two run directories hold the same training with other {' or '.join(settings)}")
+    return rows
+
+
 def report(options: argparse.Namespace, episodes: int, began: float) -> int:
     """Write tables and pictures of the run directories in ``options.run``."""
     runs = [path.parent for path in sorted(options.run.rglob("config.json"))]
@@ -247,7 +255,7 @@ def report(options: argparse.Namespace, episodes: int, began: float) -> int:
         return 1
     rows = pd.concat(found.values(), ignore_index=True)
     # Two directories may hold the same training, whose returns are then the same.
-    rows = rows.drop_duplicates([*KEY, "trained_on", "tested_on"], ignore_index=True)
+    rows = once(rows, [*KEY, "trained_on", "tested_on"], ["setting", "steps", "width"])
     lanes = rows[rows["trained_on"] == rows["tested_on"]].drop(columns="trained_on")
     lanes = lanes.rename(columns={"tested_on": "disturbance", "true_return": "mean"})
     lanes = with_others(lanes, options.out / "pendulum.parquet", "disturbance")
@@ -258,7 +266,7 @@ def report(options: argparse.Namespace, episodes: int, began: float) -> int:
     about = {**facts(lanes, began), f"trainings_below_{FAILED}": failed(lanes)}
     write_results(options.out, "pendulum", lanes, text, about)
     curves = pd.concat([curves_of(run) for run in found], ignore_index=True)
-    curves = curves.drop_duplicates([*KEY, "disturbance", "step"], ignore_index=True)
+    curves = once(curves, [*KEY, "disturbance", "step"], ["setting"])
     curves_file = options.out / "pendulum_curves.parquet"
     with_others(curves, curves_file, "disturbance").to_parquet(curves_file, index=False)
     print(text)

@@ -29,6 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m rtd3jax",
         description="List what this installation of rtd3jax offers, by name.",
+        allow_abbrev=False,
     )
     versions = [f"{name} {version}" for name, version in versions_of(_PACKAGES).items()]
     parser.add_argument("--version", action="version", version=versions[0])

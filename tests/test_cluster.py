@@ -73,10 +73,10 @@ def test_a_relative_start_is_refused_on_a_cluster():
     cells = [
         Cell("rover", "none", Config("td3", start=start)) for start in ("", "/shared/a", "~/a")
     ]
-    cluster._check_starts(cells)
+    cluster.check_absolute_starts(cells)
     relative = Cell("rover", "none", Config("td3", start="runs/a@none"))
     with pytest.raises(UserError, match="--start runs/a@none is relative.* absolute path"):
-        cluster._check_starts([*cells, relative])
+        cluster.check_absolute_starts([*cells, relative])
 
 
 def test_a_process_without_a_job_is_told_what_to_set(tmp_path):

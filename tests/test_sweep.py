@@ -16,7 +16,7 @@ from rtd3jax.config import Config
 from rtd3jax.envs import registry
 from rtd3jax.errors import UserError
 from rtd3jax.study import finish, interim, presets, recorder, references, time_estimate
-from rtd3jax.study.plan import Cell, Grid, bar_label, make_cells
+from rtd3jax.study.plan import Cell, Grid, bar_labels, make_cells
 from rtd3jax.study.presets import PRESETS
 from rtd3jax.study.results import CURVES, EPISODES, read_table
 from rtd3jax.training import lanes
@@ -164,8 +164,8 @@ def test_the_bar_names_environments_only_if_there_are_several():
     rover, pendulum = (
         SimpleNamespace(cell=Cell(env, "none", config)) for env in ("rover", "pendulum")
     )
-    assert bar_label([rover])(rover) == "lstm-td3 l=1 none"
-    assert bar_label([rover, pendulum])(rover) == "rover none lstm-td3 l=1"
+    assert bar_labels([rover])(rover) == "lstm-td3 l=1 none"
+    assert bar_labels([rover, pendulum])(rover) == "rover none lstm-td3 l=1"
 
 
 def test_presets_have_the_papers_cells():

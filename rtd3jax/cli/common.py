@@ -34,8 +34,10 @@ def exit_status(
 
     Returns:
         what ``work`` returns; 2, after one line on stderr, if the input or a file is at fault; what
-        ``interrupted`` returns, after an interrupt; 0 if the reader of the output has ended.
+        ``interrupted`` returns, after an interrupt; 0 if the reader of the output ends before the
+        command.
     """
+    status = 0
     try:
         status = work()
         sys.stdout.flush()  # else the error of a closed pipe comes at the end of the process
@@ -45,7 +47,7 @@ def exit_status(
         return interrupted(interrupt)
     except BrokenPipeError:  # the reader has ended, such as head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+        return status
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
     except OSError as error:

@@ -9,9 +9,7 @@ import argparse
 import collections
 import dataclasses
 import functools
-import signal
 import sys
-import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -21,7 +19,7 @@ import jax
 from rtd3jax.cli import sweep_options
 from rtd3jax.cli.common import exit_status
 from rtd3jax.errors import UserError
-from rtd3jax.study.cluster import train_on_cluster
+from rtd3jax.study.cluster import check_absolute_starts, train_on_cluster
 from rtd3jax.study.execute import Work, train_here, waiting_jobs
 from rtd3jax.study.hosts import own_shard, own_share, relaunch
 from rtd3jax.study.lock import parse_shard, writer
@@ -35,6 +33,7 @@ from rtd3jax.study.rundir import RunDirectory, holds_study
 from rtd3jax.study.starts import check_starts_stay, planned_jobs
 from rtd3jax.study.status import ledger
 from rtd3jax.system.imports import import_modules
+from rtd3jax.system.interrupts import Terminated, terminable
 from rtd3jax.training.lanes import Job, workers
 from rtd3jax.training.run import check_strategy
 
@@ -50,14 +49,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    before = _on_termination(_terminate)
-    try:
+    with terminable():
         # Interrupts during the training do not arrive here: `run_study` handles them.
         return exit_status(
             lambda: _start(options, arguments), lambda: sweep_options.out(options), _status_of
         )
-    finally:
-        _on_termination(before)
 
 
 def _start(options: argparse.Namespace, arguments: Sequence[str] | None) -> int:
@@ -69,23 +65,8 @@ def _start(options: argparse.Namespace, arguments: Sequence[str] | None) -> int:
     return _run(options)
 
 
-class _Terminated(KeyboardInterrupt):
-    """Raised at SIGTERM, so that lanes write their checkpoints as they do after Ctrl-C."""
-
-
-def _terminate(*_: object) -> None:
-    raise _Terminated
-
-
 def _status_of(interrupt: KeyboardInterrupt) -> int:
-    return 143 if isinstance(interrupt, _Terminated) else 130
-
-
-def _on_termination(handler: Any) -> Any:
-    """Set the handler of SIGTERM and return the previous one; only the main thread can do so."""
-    if threading.current_thread() is not threading.main_thread():
-        return None
-    return signal.signal(signal.SIGTERM, handler)
+    return 143 if isinstance(interrupt, Terminated) else 130
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -140,6 +121,8 @@ def _plan(options: argparse.Namespace) -> _Plan:
     directory = RunDirectory(out, cells, seeds, episodes)
     if options.fresh and holds_study(out):
         check_starts_stay(cells, out)
+    if options.cluster:
+        check_absolute_starts(cells)
     additions = "" if options.fresh else directory.plan()
     jobs = planned_jobs(directory, strategy, fresh=options.fresh)
     waiting = [job for job in jobs if options.fresh or not directory.lanes.is_done(*job.key)]
@@ -159,11 +142,12 @@ def _dry_run(plan: _Plan, options: argparse.Namespace) -> int:
     directory, memory = plan.directory, usable_memory()
     say = functools.partial(print, file=sys.stderr, flush=True)
     jobs = plan.jobs
-    if not options.fresh and not (jobs := waiting_jobs(directory, jobs)):
-        return 0
-    print(plan_text(directory.cells, directory.seeds, jobs, plan.strategy, memory, say))
-    if not any(_divided(options)):
-        print(f"trained by {plan.shares}")
+    if not options.fresh:
+        jobs = waiting_jobs(directory, jobs)
+    if jobs:
+        print(plan_text(directory.cells, directory.seeds, jobs, plan.strategy, memory, say))
+        if not any(_divided(options)):
+            print(f"trained by {plan.shares}")
     print(plan.additions, end="\n" if plan.additions else "")
     return 0
 

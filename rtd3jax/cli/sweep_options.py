@@ -131,7 +131,8 @@ def parser(description: str | None) -> argparse.ArgumentParser:
     work.add_argument(
         "--strategy",
         choices=("map", "vmap"),
-        help="map: train lanes one after the other; vmap: in one batched program",
+        help="map: train lanes one after the other; vmap: in one batched program, except for "
+        "lanes with simulators",
     )
     config = found.add_argument_group("the configuration of every cell")
     for field in dataclasses.fields(Config):

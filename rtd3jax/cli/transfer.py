@@ -28,7 +28,7 @@ def _run(options: argparse.Namespace) -> int:
     page = directory.path / NAME
     refresh_page(directory, complete=not page.exists())
     lanes = ["env", "algorithm", "history_length", "trained_on"]
-    # A mean without its episodes that are not finite would be too high.
+    # As in `seed_means`: an agent with an episode that is not a number has no mean.
     cells = rows.groupby([*lanes, "tested_on"], sort=False)["return"]
     means = cells.agg(lambda returns: returns.mean(skipna=False)).unstack(sort=False)
     print(means.round(3).to_string())

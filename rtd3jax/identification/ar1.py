@@ -44,8 +44,8 @@ def fit_ar1(parts: Sequence[np.ndarray], max_slip: float | None = None) -> Fit:
 
     rho = min(max(products[1] / products[0], 0.0), 1.0)
     sigma = max(float(np.std(y - rho * x)), 1e-6)
-    if np.ptp(y - rho * x) == 0.0:
-        raise UserError("ar1: the log has no random part")
+    if np.ptp(y - rho * x) <= 1e-9 * bound:
+        raise UserError("ar1: the log has no random part, so there is nothing to fit")
     ranges = [(0.0, 1.0), (math.log(1e-7), math.log(10.0))]
     start = np.array([rho, math.log(sigma)])
     found = minimize(loss, start, method="L-BFGS-B", bounds=ranges, options={"ftol": 1e-12})

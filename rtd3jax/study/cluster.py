@@ -85,13 +85,13 @@ def train_on_cluster(
         waiting.setdefault(job.cell, []).append(job)
     if not waiting:
         return
-    _check_starts(waiting)
-    for job in itertools.chain.from_iterable(waiting.values()):
-        directory.lanes.error_path(*job.key).unlink(missing_ok=True)
+    check_absolute_starts(waiting)
     ray = _ray()
     with _connected(ray, address):
         needs = {cell: _need(members, work, _alive(ray)) for cell, members in waiting.items()}
         _check_nodes(ray, _alive(ray), directory, imports)
+        for job in itertools.chain.from_iterable(waiting.values()):
+            directory.lanes.error_path(*job.key).unlink(missing_ok=True)
         task = ray.remote(_train_cell)
         pending = {}
         for cell, members in waiting.items():
@@ -112,7 +112,7 @@ def train_on_cluster(
         _watch(ray, directory, pending, complaints, interim, log, work.quiet)
 
 
-def _check_starts(cells: Iterable[Cell]) -> None:
+def check_absolute_starts(cells: Iterable[Cell]) -> None:
     """Raise UserError if the start of a cell is a relative path: a node has another directory."""
     for cell in cells:
         start = cell.config.start

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from rtd3jax.errors import UserError
-from rtd3jax.study.plants import differing_plants
+from rtd3jax.study.plants import differing_plants, plant_name
 from rtd3jax.study.results import CELL, is_trained
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.statistics import compare, seed_means, summarise
@@ -72,9 +72,11 @@ def differing_settings(
     """A text for each setting, and each plant, in which runs differ in the cells of ``table``."""
     wanted = set(table[list(CELL)].itertuples(index=False, name=None))
     found: dict[str, dict[str, list[str]]] = {}
+    shown = set()
     for name, directory in zip(names, directories, strict=True):
         for cell in directory.cells:
             if tuple(cell.key[column] for column in CELL) in wanted:
+                shown.add(plant_name(cell))
                 for field, value in {
                     **cell.to_dict(),
                     "final episodes": directory.episodes,
@@ -82,8 +84,6 @@ def differing_settings(
                     values = found.setdefault(field, {}).setdefault(name, [])
                     values += [str(value)] if str(value) not in values else []
     plants = [directory.known_plants() for directory in directories]
-    # Names of plants begin as the cells' columns: the environment, then the disturbance.
-    shown = {f"{env} {disturbance}" for env, disturbance, *_ in wanted}
     first = {name: plant for name, plant in plants[0].items() if name in shown}
     changed = [
         f"plant of {names[0]} (there) and {name} (here): {text}"

@@ -10,7 +10,7 @@ from rtd3jax.study.derive import Reference
 from rtd3jax.study.interim import InterimResults
 from rtd3jax.study.loggers import Logger
 from rtd3jax.study.memory_plan import lanes_in_total
-from rtd3jax.study.plan import bar_label
+from rtd3jax.study.plan import bar_labels
 from rtd3jax.study.recorder import Recorder
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.starts import add_starts
@@ -77,7 +77,7 @@ def train_here(
     recorder = Recorder(
         directory, checkpoints, interim, logger, complaints, keep=work.keep, began=work.began
     )
-    with Progress(groups, bar_label(waiting), enabled=not work.quiet) as bar:
+    with Progress(groups, bar_labels(waiting), enabled=not work.quiet) as bar:
 
         def on_chunk(group: Group) -> None:
             bar.update(group)

@@ -4,7 +4,7 @@ import sys
 import time
 from collections.abc import Sequence
 
-from rtd3jax.errors import UserError, short_reason
+from rtd3jax.errors import short_reason
 from rtd3jax.study.derive import Reference, derive
 from rtd3jax.study.report.page import refresh_page
 from rtd3jax.study.rundir import RunDirectory
@@ -34,7 +34,7 @@ class InterimResults:
             derive(self._directory, self._references)
             if self._page:
                 refresh_page(self._directory, complete=False)
-        except (UserError, OSError) as error:
+        except Exception as error:
             if (reason := short_reason(error)) not in self._said:
                 print(f"no tables during the training: {reason}", file=sys.stderr)
                 self._said.add(reason)

@@ -70,8 +70,8 @@ class Cell:
         return cls(fields["env"], fields["disturbance"], Config.from_dict(config))
 
 
-def bar_label(jobs: Iterable[Job]) -> Callable[[Job], str]:
-    """A job's cell in words for the bar of ``jobs``: it has little space for the environment."""
+def bar_labels(jobs: Iterable[Job]) -> Callable[[Job], str]:
+    """A function that names a job on the bar, with its environment if ``jobs`` have several."""
     if len({job.cell.env for job in jobs}) > 1:
         return lambda job: job.cell.words
     return lambda job: f"{job.cell.config.words} {job.cell.disturbance}"

@@ -128,12 +128,13 @@ def _names(params: object) -> list[str]:
 def _difference(before: dict[str, Any], now: dict[str, Any], parts: Iterable[str]) -> str:
     """The first difference of two plants in words, with the name of a parameter.
 
-    A study of an earlier version does not state the names.
+    A study of an earlier version does not state the names, or even the parameters.
     """
-    names = before.get(NAMES, now[NAMES])
-    if len(names) == len(before["params"]):
+    own = now.get(NAMES) or before.get(NAMES) or []
+    names = before.get(NAMES) or own
+    if "params" in parts and len(names) == len(before["params"]) and len(own) == len(now["params"]):
         one = dict(zip(names, before["params"], strict=True))
-        other = dict(zip(now[NAMES], now["params"], strict=True))
+        other = dict(zip(own, now["params"], strict=True))
         if not same(one, other):
             return difference(one, other)
     ordered = [part for part in now if part in parts]

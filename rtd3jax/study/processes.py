@@ -24,7 +24,7 @@ from rtd3jax.study.interim import InterimResults
 from rtd3jax.study.log import LOG, repair_log
 from rtd3jax.study.log_reader import LogReader
 from rtd3jax.study.loggers import Logger
-from rtd3jax.study.plan import bar_label
+from rtd3jax.study.plan import bar_labels
 from rtd3jax.study.process_plan import Shares
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.training.lanes import Group, Job, make_groups
@@ -81,7 +81,7 @@ def train_in_processes(
     groups = make_groups(waiting, work.strategy, 1)
     try:
         with (
-            Progress(groups, bar_label(waiting), enabled=not work.quiet) as bar,
+            Progress(groups, bar_labels(waiting), enabled=not work.quiet) as bar,
             Crew(shares.cores, settings, handles) as crew,
         ):
             study = _Study(directory, groups, crew, shares.lanes, complaints, bar.update)

@@ -67,9 +67,10 @@ class Recorder:
                 try:
                     final = self._final_returns(job, state)
                 except Exception as error:  # too many episodes for the memory, for example
-                    self._checkpoints.save_lane(job, state, group.step, kept=1)
-                    reason = f"its final evaluation: {short_reason(error)}"
-                    self._note_failure(job, reason)
+                    if not stays:
+                        self._checkpoints.save_lane(job, state, group.step, kept=1)
+                    why = short_reason(error)
+                    self._note_failure(job, f"its final evaluation: {why}; its training is kept")
                     continue
                 self._keep(job, state, final)
                 if not stays:
@@ -118,7 +119,7 @@ class Recorder:
         self._complaints.append(f"{cell.words} seed {seed} failed: {reason}")
 
     def _final_returns(self, job: Job, state: LaneState) -> np.ndarray:
-        """Returns, and returns of the undisturbed state, [2, episodes]; NaN if a lane was lost."""
+        """Returns, and returns of the true state: [2, episodes]; NaN if the lane was lost."""
         (cell, seed), episodes = job.key, self._directory.episodes
         if int(state.failure) != HEALTHY:
             return np.full((2, episodes), np.nan, np.float32)

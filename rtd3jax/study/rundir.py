@@ -169,7 +169,7 @@ class RunDirectory:
                 raise UserError(
                     f"--out {self.path} is not empty and holds no study; choose another directory"
                 )
-            self._plants(self._asked.cells)  # takes time, for which other shards would wait below
+            self._plants(self._asked.cells)  # takes time: below, other shards would wait for it
             for last in (*[False] * _PATIENCE, True):
                 news = self.plan()
                 if holds_study(self.path) and not self._lacks_something():

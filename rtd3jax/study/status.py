@@ -40,10 +40,10 @@ def _lane_status(
         if failure is not None:
             return {"status": "lost", "step": failure["step"], "reason": failure["reason"]}
         return {"status": "done", "step": cell.config.total_steps, "reason": ""}
-    if (reason := lanes.error(cell, seed)) is not None:
-        return {"status": "failed", "step": 0, "reason": reason}
     steps = checkpoint_steps(lanes.checkpoint_directory(cell, seed))
     kept = max(steps, default=0)
+    if (reason := lanes.error(cell, seed)) is not None:
+        return {"status": "failed", "step": kept, "reason": reason}
     reached = logged.get(lane_of({**cell.key, "seed": seed}), 0)
     # If the log reaches the end but there is no file, the file was removed to train again.
     reached = max(kept, reached if reached < cell.config.total_steps else 0)

@@ -31,6 +31,7 @@ from rtd3jax.study.starts import planned_jobs
 from rtd3jax.study.status import ledger
 from rtd3jax.study.tables import current_tables
 from rtd3jax.system.files import user_path
+from rtd3jax.system.interrupts import terminable
 from rtd3jax.training.lanes import workers
 from rtd3jax.training.run import check_checkpoints, check_seeds, check_strategy
 
@@ -103,7 +104,8 @@ class Study:
         Raises:
             UserError: when a cell cannot be trained, a tracker cannot be opened, not even one lane
                 fits in memory, or another process writes to the directory.
-            KeyboardInterrupt: after an interrupt, when the results so far are written.
+            KeyboardInterrupt: after Ctrl-C or SIGTERM, when checkpoints and the results so far are
+                written. A program's own handler of SIGTERM stays in force.
         """
         directory, strategy = self._directory, check_strategy(strategy)
         check_loggers(log)
@@ -116,7 +118,8 @@ class Study:
         # So far, a UserError has left the directory as it was.
         if news := directory.prepare():
             print(news)
-        complaints, interrupt = run_study(directory, jobs, work, log=log)
+        with terminable():
+            complaints, interrupt = run_study(directory, jobs, work, log=log)
         if interrupt is not None:
             raise interrupt
         return complaints

@@ -1,4 +1,4 @@
-"""Interrupts while work is being saved: the first one waits, the second one ends the process."""
+"""Interrupts: SIGTERM as Ctrl-C; and while work is being saved, the first one waits."""
 
 import contextlib
 import signal
@@ -8,6 +8,31 @@ from collections.abc import Iterator
 from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Terminated(KeyboardInterrupt):
+    """Raised at SIGTERM, so that lanes write their checkpoints as they do after Ctrl-C."""
+
+
+@contextlib.contextmanager
+def terminable() -> Iterator[None]:
+    """A context in which SIGTERM, which a batch system sends before SIGKILL, raises `Terminated`.
+
+    It has no effect in other threads than the main one, and if the program has its own handler.
+    """
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    if not in_main_thread or signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
+        yield
+        return
+
+    def terminate(*_: object) -> None:
+        raise Terminated
+
+    signal.signal(signal.SIGTERM, terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 @contextlib.contextmanager

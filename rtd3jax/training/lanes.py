@@ -4,8 +4,7 @@ A *group* is a set of lanes that one call of a compiled program advances. On a C
 single lane: the results of a lane then do not depend on other lanes, and no product is split over
 threads. On an accelerator, a group holds all lanes of a program under ``vmap``, because wider
 products cost little there; a lane with a simulator on the host is a group of its own there, too.
-Each worker takes the group with the fewest steps, so that five lanes
-keep two cores equally busy.
+Each worker takes the group with the fewest steps, so that five lanes keep two cores equally busy.
 """
 
 import contextlib
@@ -199,8 +198,11 @@ def make_groups(
             count = devices if len(parts) == 1 else -(-len(part) // width)
             shares += [part[start::count] for start in range(min(count, len(part)))]
     chunks = [share[k : k + most] for share in shares for k in range(0, len(share), most)]
-    # Lanes that fit in memory alone need not fit together with lanes that wait.
-    return [Group(chunk, wave=index // devices) for index, chunk in enumerate(chunks)]
+    # Lanes that fit in memory alone need not fit together with lanes that wait. Lanes with
+    # simulators wait only for memory, as under `map`.
+    alone = all(advances_alone(job, strategy) for job in jobs)
+    in_a_wave = devices * most if alone else devices
+    return [Group(chunk, wave=index // in_a_wave) for index, chunk in enumerate(chunks)]
 
 
 def with_common_steps(members: Sequence[Any], steps: Sequence[set[int]]) -> list[list[Any]]:

@@ -114,6 +114,15 @@ def test_runs_of_another_plant_with_the_same_name_differ():
     assert differing_plants(before, before) == []
     (text,) = differing_plants(before, now)
     assert text == "own none (mass: 1.0 there, 2.0 here)"
+    # Studies of earlier versions do not state the names.
+    for old, new in ((0, 1), (1, 0), (0, 0)):
+        sides = before["own none"], now["own none"]
+        stated = [
+            {name: part for name, part in side.items() if named or name != "names"}
+            for side, named in zip(sides, (old, new), strict=True)
+        ]
+        (text,) = differing_plants({"own none": stated[0]}, {"own none": stated[1]})
+        assert "1.0" in text and "2.0" in text
 
 
 def test_the_first_run_is_what_others_are_compared_with(runs):

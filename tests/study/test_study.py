@@ -1,13 +1,17 @@
 """Tests that `Study` writes the same files as the sweep."""
 
+import os
+import signal
+
 import pandas as pd
 import pytest
 
 import rtd3jax as rtd
 from rtd3jax import sweep
 from rtd3jax.cli import sweep as sweep_module
-from rtd3jax.study import run
+from rtd3jax.study import recorder, run
 from rtd3jax.study.lock import is_held
+from rtd3jax.training import lanes
 
 TINY = dict(
     total_steps=60,
@@ -127,3 +131,23 @@ def test_after_an_interrupt_the_page_does_not_say_that_lanes_are_running(
         command = "--env rover --disturbances ar1-slip --algorithms td3 --history-lengths 1 --seeds"
         assert sweep.main([*command.split(), "1", "--out", str(tmp_path / "run")]) == 130
     assert held == [True, False]
+
+
+def test_sigterm_leaves_checkpoints_of_a_study_too(tmp_path, monkeypatch):
+    real = recorder.Recorder.update
+
+    def update(self, group):
+        real(self, group)
+        if group.step >= 20:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(lanes, "_FIRST_CHUNK", 10)
+        patch.setattr(lanes, "CHUNK_SECONDS", 0.0)
+        patch.setattr(recorder.Recorder, "update", update)
+        study = rtd.Study(_cells(), seeds=[0], out=tmp_path / "run")
+        with pytest.raises(KeyboardInterrupt):
+            study.run(quiet=True, page=False)
+    assert list((tmp_path / "run").rglob("step-*.safetensors"))
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+    assert study.run(quiet=True, page=False) == []

@@ -72,7 +72,7 @@ def test_commands_end_in_one_line_after_an_interrupt_or_a_closed_pipe(capsys, mo
 
     redirected.clear()
     monkeypatch.setattr(common.sys, "stdout", Closed())
-    assert common.exit_status(lambda: 7, lambda: "run") == 0 and redirected
+    assert common.exit_status(lambda: 7, lambda: "run") == 7 and redirected
 
 
 def test_the_last_line_of_a_traceback_says_most():

@@ -101,7 +101,7 @@ def page_data(directory: RunDirectory, *, complete: bool, playback: bool) -> dic
     data["playback"] = []
     if playback:
         data["playback"] = recordings(directory, lanes, record=complete, notes=notes)
-    data["played"] = playback
+    data["with_playback"] = playback
     data["notes"] = notes
     data["complete"] = complete
     data["written"] = datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC")

@@ -138,7 +138,8 @@ def test_lanes_with_simulators_train_one_by_one_also_under_vmap():
     """JAX cannot batch the condition in which an evaluation calls a simulator."""
     jobs = make_jobs(environment(), SMALL, range(3))
     groups = make_groups(jobs, "vmap", 1)
-    assert [len(group.jobs) for group in groups] == [1, 1, 1]
+    assert [(len(group.jobs), group.wave) for group in groups] == [(1, 0)] * 3
+    assert [group.wave for group in make_groups(jobs, "vmap", 1, 2)] == [0, 0, 1]
     assert study_seconds(jobs, "vmap", lambda config: 1.0) > 0
     runs = [
         rtd.train(environment(), SMALL, seeds=range(3), progress=False, strategy=strategy)
@@ -237,7 +238,7 @@ def test_a_lost_lane_has_no_simulator_of_another_process():
     close_simulators()
 
 
-def test_a_lane_that_gets_more_steps_takes_no_simulator(tmp_path):
+def test_a_lane_that_gets_more_steps_takes_no_simulator():
     from rtd3jax.training.checkpoint import _extended, to_arrays
 
     env = environment()

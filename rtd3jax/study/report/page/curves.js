@@ -12,7 +12,7 @@ function curvePanels() {
     // may be a hundred times lower than late returns: the lowest tenth of all points may be cut off.
     const lows = curves.flatMap((curve) => curve.low.map((low, k) => (finite(low) ? low : curve.iqm[k])));
     // No curve ends below the panel, however few of the points are its own.
-    const ends = curves.map((curve) => curve.iqm.filter(finite).pop()).filter(finite);
+    const ends = curves.map((curve) => curve.low.map((low, k) => (finite(low) ? low : curve.iqm[k])).filter(finite).pop()).filter(finite);
     const floor = lowest([quantile(lows, 0.1), ...ends]);
     const kept = curves.flatMap((curve) => [...curve.low, ...curve.high, ...curve.iqm]).filter((value) => value >= floor);
     const range = { ...limits(kept, references), cut: lowest(lows.filter(finite)) < floor };

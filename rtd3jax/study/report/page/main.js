@@ -21,7 +21,7 @@ const textOf = (value) => (value === null ? DASH : Number.isInteger(value) ? val
 function drawStudy() {
   const { settings } = DATA.study;
   const rows = settings.map(({ name, values, about }) => el('tr', {}, el('td', {}, name),
-    el('td', {}, values.map(textOf).join(', ')), el('td', {}, about)));
+    el('td', {}, values.map(textOf).join('; ')), el('td', {}, about)));
   const configuration = el('div', {}, el('h3', {}, 'Configuration'),
     el('div', { class: 'scroll', tabindex: 0, role: 'region', 'aria-label': 'Configuration' },
       el('table', { class: 'data wrap' }, el('thead', {}, el('tr', {}, ['setting', 'value', 'meaning'].map((name) => el('th', { scope: 'col' }, name)))), el('tbody', {}, rows))));
@@ -49,7 +49,7 @@ function troubles() {
   if (!DATA.troubles.length) return [];
   const rows = DATA.troubles.map((row) => [`${row.env}, ${row.disturbance}, ${row.algorithm}, history ${row.history_length}, seed ${row.seed}`,
     `${row.status} at step ${row.step.toLocaleString('en')}${row.reason ? `: ${row.reason}` : ''}`]);
-  return [el('h3', {}, 'Lanes that are not done'), pairs(rows)];
+  return [el('h3', {}, 'Lanes that run, were interrupted, were lost or failed'), pairs(rows)];
 }
 
 function redraw() {

@@ -23,8 +23,8 @@ function startPlayback() {
   const about = section.querySelector('.about');
   const body = section.querySelector('.body');
   if (!DATA.playback.length) {
-    about.textContent = !DATA.played ? 'Episodes were left out (--no-playback).'
-      : DATA.status.done && DATA.complete ? 'No episode could be recorded: see the notes above.'
+    about.textContent = !DATA.with_playback ? 'Episodes were left out (--no-playback).'
+      : DATA.status.done && DATA.complete ? 'No episode could be recorded, or no agent has a finite return; see the notes above.'
       : DATA.complete ? 'No policy has been trained yet.'
       : 'Episodes are recorded when the sweep has ended; python -m rtd3jax.report RUN records episodes of the agents that are trained.';
     body.replaceChildren();

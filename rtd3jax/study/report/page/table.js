@@ -33,11 +33,10 @@ function stateOf(cell) {
   const lost = final && final.lost ? `, ${final.lost} lost` : '';
   const ended = final ? final.n + final.lost : 0;
   if (ended === cell.seeds) return `done${lost}`;
-  // The states as --status prints them; an ended lane may not be in the tables yet.
-  const { planned = 0, failed = 0, ...others } = cell.statuses;
-  const parts = failed ? [`${failed} failed`] : [];
-  if (Object.values(others).some(Boolean)) parts.unshift('under way');
-  return `${parts.join(', ') || 'planned'}${lost}`;
+  // The words of --status, but for lanes that a sweep has begun and not ended.
+  const { done = 0, failed = 0, running = 0, interrupted = 0 } = cell.statuses;
+  const parts = [done && `${done} of ${cell.seeds} done`, failed && `${failed} failed`, (running || interrupted) && 'under way'];
+  return `${parts.filter(Boolean).join(', ') || 'planned'}${lost}`;
 }
 
 function tableRows() {
