@@ -43,7 +43,7 @@ def test_a_lane_is_timed_without_its_random_steps(monkeypatch):
     (job, _), told = _jobs("td3"), []
     seconds = time_estimate.study_seconds([job], "map", lambda config: 1.0, told.append)
     assert np.isfinite(seconds) and seconds > 0.0
-    assert told == ["timing 1 of 1: td3 l=0"]
+    assert told == ["timing 1 of 1: td3"]
     (untrained, _) = _jobs("td3", total_steps=1_000, learning_starts=1_000)
     monkeypatch.setattr(time_estimate, "_timed", lambda *_: (1.0, 5.0))
     with_updates, without = (
