@@ -3,9 +3,9 @@
 The cells are six agents under the paper's four disturbances, and `lstm-td3` with and without past
 actions under three other disturbances, for which the paper compares both. Each has every window
 length. Beyond the paper, `CLEAN_NOISE` can be given as a disturbance: claim 11 compares agents that
-learned under it. The settings are those of the preset `pendulum`; experiments/pendulum_search.py found them
-under `hidden`. `h-td3` has different settings, because its critics read carries that an old version
-of the actor stored.
+learned under it. The settings are those of the preset `pendulum`; experiments/pendulum_search.py
+found them under `hidden`. `h-td3` has different settings, because its critics read carries that an
+old version of the actor stored.
 """
 
 import argparse
