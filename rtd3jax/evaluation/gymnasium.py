@@ -52,8 +52,7 @@ def run_in_gymnasium(
 
 
 def _play(policy: PolicyLike, env: gymnasium.Env, episodes: int, seed: int) -> np.ndarray:
-    space = _check_spaces(policy, env)
-    policy = fitted(policy, space.shape)
+    policy, space = _checked(policy, env)
     low, high = space.low.astype(np.float64), space.high.astype(np.float64)
     types = node_types(policy)
     returns = np.zeros(episodes)
@@ -89,8 +88,12 @@ def _act(
     return policy.step(state, observation)
 
 
-def _check_spaces(policy: PolicyLike, env: gymnasium.Env) -> gymnasium.spaces.Box:
-    """The space of actions; UserError if policy and environment do not fit together."""
+def _checked(policy: PolicyLike, env: gymnasium.Env) -> tuple[Any, gymnasium.spaces.Box]:
+    """The policy, with actions of the environment's shape, and the space of actions.
+
+    Raises:
+        UserError: if policy and environment do not fit together.
+    """
     if not isinstance(env, gymnasium.Env):
         raise UserError(
             f"{type(env).__name__} is not a gymnasium.Env; for a gymnax environment use "
@@ -118,4 +121,4 @@ def _check_spaces(policy: PolicyLike, env: gymnasium.Env) -> gymnasium.spaces.Bo
         ) from error
     if shape != actions.shape:
         raise UserError(f"the policy's action has shape {shape}, the environment's {actions.shape}")
-    return actions
+    return policy, actions

@@ -26,7 +26,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from rtd3jax.errors import UserError, short_reason
 from rtd3jax.study.derive import Reference
-from rtd3jax.study.execute import Work, train_here, waiting_jobs
+from rtd3jax.study.execute import Work, forget_errors, train_here, waiting_jobs
 from rtd3jax.study.interim import InterimResults
 from rtd3jax.study.lane_files import cell_name
 from rtd3jax.study.log import TASKS
@@ -77,21 +77,19 @@ def train_on_cluster(
         imports: modules that register environments.
 
     Raises:
-        UserError: when a start is a relative path, Ray is not installed, there is no cluster, no
-            node has the resources, or a node has other versions or cannot read the run directory.
+        UserError: when Ray is not installed, there is no cluster, no node has the resources, or a
+            node has other versions or cannot read the run directory.
     """
     waiting: dict[Cell, list[Job]] = {}
     for job in waiting_jobs(directory, jobs):
         waiting.setdefault(job.cell, []).append(job)
     if not waiting:
         return
-    check_absolute_starts(waiting)
     ray = _ray()
     with _connected(ray, address):
         needs = {cell: _need(members, work, _alive(ray)) for cell, members in waiting.items()}
         _check_nodes(ray, _alive(ray), directory, imports)
-        for job in itertools.chain.from_iterable(waiting.values()):
-            directory.lanes.error_path(*job.key).unlink(missing_ok=True)
+        forget_errors(directory, itertools.chain.from_iterable(waiting.values()))
         task = ray.remote(_train_cell)
         pending = {}
         for cell, members in waiting.items():

@@ -1,7 +1,7 @@
 """Trains lanes of a run directory in this process."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jax
@@ -64,8 +64,7 @@ def train_here(
     """
     waiting = waiting_jobs(directory, jobs)
     add_starts(directory, waiting, write=True)
-    for job in waiting:
-        directory.lanes.error_path(*job.key).unlink(missing_ok=True)
+    forget_errors(directory, waiting)
     devices = workers()[: work.workers]
     in_total = lanes_in_total(work.at_once, work.strategy, len(devices))
     if in_total < len(waiting) and not work.quiet:
@@ -93,6 +92,12 @@ def waiting_jobs(directory: RunDirectory, jobs: Sequence[Job]) -> list[Job]:
     if len(waiting) < len(jobs):
         print(f"{len(jobs) - len(waiting)} of {len(jobs)} lanes have ended already")
     return waiting
+
+
+def forget_errors(directory: RunDirectory, jobs: Iterable[Job]) -> None:
+    """Remove the reasons why lanes failed before, because they are trained now."""
+    for job in jobs:
+        directory.lanes.error_path(*job.key).unlink(missing_ok=True)
 
 
 def checkpoints_of(

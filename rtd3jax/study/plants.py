@@ -50,9 +50,7 @@ def check_plants(path: Path, before: Plants, now: Plants) -> list[str]:
     lines = []
     for name, plant in now.items():
         there = before.get(name, {})
-        compared = plant.keys() & there.keys() - {CODE, NAMES}
-        if any(not same(there[part], plant[part]) for part in compared):
-            changed = _difference(there, plant, compared)
+        if changed := _changed(there, plant):
             raise UserError(
                 f"{path} holds lanes of another plant with the name {name} ({changed}): register "
                 "the changed plant under another name, or use another run directory"
@@ -71,9 +69,8 @@ def differing_plants(before: Plants, now: Plants) -> list[str]:
     found = []
     for name in before.keys() & now.keys():
         there, plant = before[name], now[name]
-        compared = plant.keys() & there.keys() - {CODE, NAMES}
-        if any(not same(there[part], plant[part]) for part in compared):
-            found.append(f"{name} ({_difference(there, plant, compared)})")
+        if changed := _changed(there, plant):
+            found.append(f"{name} ({changed})")
         elif is_other_code(there.get(CODE), plant.get(CODE)):
             found.append(f"{name} (its code)")
     return sorted(found)
@@ -123,6 +120,14 @@ def _names(params: object) -> list[str]:
     """The names of the numbers of an environment's parameters, such as ``env.mass``."""
     paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(params)]
     return [jax.tree_util.keystr(path).lstrip(".") for path in paths]
+
+
+def _changed(before: dict[str, Any], now: dict[str, Any]) -> str:
+    """The first difference of two plants but for their code, in words; "" if there is none."""
+    compared = now.keys() & before.keys() - {CODE, NAMES}
+    if all(same(before[part], now[part]) for part in compared):
+        return ""
+    return _difference(before, now, compared)
 
 
 def _difference(before: dict[str, Any], now: dict[str, Any], parts: Iterable[str]) -> str:

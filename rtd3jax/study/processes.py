@@ -19,7 +19,7 @@ import numpy as np
 from rtd3jax.errors import UserError
 from rtd3jax.study.crew import Crew, Member
 from rtd3jax.study.derive import Reference
-from rtd3jax.study.execute import Work, waiting_jobs
+from rtd3jax.study.execute import Work, forget_errors, waiting_jobs
 from rtd3jax.study.interim import InterimResults
 from rtd3jax.study.log import LOG, repair_log
 from rtd3jax.study.log_reader import LogReader
@@ -67,8 +67,7 @@ def train_in_processes(
     waiting = waiting_jobs(directory, jobs)
     if not waiting:
         return
-    for job in waiting:
-        directory.lanes.error_path(*job.key).unlink(missing_ok=True)
+    forget_errors(directory, waiting)
     repair_log(directory.path / LOG)
     inner = dataclasses.replace(work, quiet=True, at_once=shares.lanes, began=time.perf_counter())
     settings = {

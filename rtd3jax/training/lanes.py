@@ -183,8 +183,9 @@ def make_groups(
     split, and a group waits until earlier groups have ended.
     """
     most = at_once or len(jobs)
-    if strategy == "map":
-        return [Group([job], wave=index // most) for index, job in enumerate(jobs)]
+    if all(advances_alone(job, strategy) for job in jobs):
+        in_total = most if strategy == "map" else most * devices
+        return [Group([job], wave=index // in_total) for index, job in enumerate(jobs)]
     by_executable: dict[Any, list[Job]] = {}
     for job in jobs:
         together = job if advances_alone(job, strategy) else job.executable
@@ -198,11 +199,8 @@ def make_groups(
             count = devices if len(parts) == 1 else -(-len(part) // width)
             shares += [part[start::count] for start in range(min(count, len(part)))]
     chunks = [share[k : k + most] for share in shares for k in range(0, len(share), most)]
-    # Lanes that fit in memory alone need not fit together with lanes that wait. Lanes with
-    # simulators wait only for memory, as under `map`.
-    alone = all(advances_alone(job, strategy) for job in jobs)
-    in_a_wave = devices * most if alone else devices
-    return [Group(chunk, wave=index // in_a_wave) for index, chunk in enumerate(chunks)]
+    # Lanes that fit in memory alone need not fit together with lanes that wait.
+    return [Group(chunk, wave=index // devices) for index, chunk in enumerate(chunks)]
 
 
 def with_common_steps(members: Sequence[Any], steps: Sequence[set[int]]) -> list[list[Any]]:

@@ -10,12 +10,13 @@ function curvePanels() {
     const curves = cells.map((cell) => cell.curves[state.measure]).filter(Boolean);
     // The same range for all lengths of an environment, so that its panels can be compared. Early returns
     // may be a hundred times lower than late returns: the lowest tenth of all points may be cut off.
-    const lows = curves.flatMap((curve) => curve.low.map((low, k) => (finite(low) ? low : curve.iqm[k])));
+    const bottoms = curves.map((curve) => curve.low.map((low, k) => (finite(low) ? low : curve.iqm[k])).filter(finite));
+    const lows = bottoms.flat();
     // No curve ends below the panel, however few of the points are its own.
-    const ends = curves.map((curve) => curve.low.map((low, k) => (finite(low) ? low : curve.iqm[k])).filter(finite).pop()).filter(finite);
+    const ends = bottoms.filter((bottom) => bottom.length).map((bottom) => bottom.at(-1));
     const floor = lowest([quantile(lows, 0.1), ...ends]);
     const kept = curves.flatMap((curve) => [...curve.low, ...curve.high, ...curve.iqm]).filter((value) => value >= floor);
-    const range = { ...limits(kept, references), cut: lowest(lows.filter(finite)) < floor };
+    const range = { ...limits(kept, references), cut: lowest(lows) < floor };
     for (const length of lengths.length ? lengths : [0]) {
       const here = cells.filter((cell) => cell.length === 0 || cell.length === length);
       panels.push({ environment, length, cells: here, range });
