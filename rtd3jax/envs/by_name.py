@@ -13,7 +13,7 @@ from rtd3jax.envs.disturbed import (
 from rtd3jax.envs.parameters import assign, settable
 from rtd3jax.envs.processes.mixture import Mixture
 from rtd3jax.envs.processes.process import NoDisturbance, Process, require
-from rtd3jax.envs.registered import FAULT_PROCESSES, Registered
+from rtd3jax.envs.registered import FAULT_PROCESSES, Registered, with_defaults
 from rtd3jax.errors import UserError, nearest
 
 
@@ -66,7 +66,7 @@ def disturbed_by_name(
     for channel in {channel for channel, _ in entry.disturbances.values()} - {*CHANNELS}:
         params = params.replace(**{channel: on(channel)})
     if entry.with_params is not None:
-        base = entry.with_params(params)
+        base = with_defaults(env_id, entry, params)
         if all(isinstance(on(channel), NoDisturbance) for channel in CHANNELS):
             return base
     acting = {channel: on(channel) for channel in CHANNELS}

@@ -26,6 +26,7 @@ from rtd3jax.envs.interface import (
 )
 from rtd3jax.errors import UserError, typed_reason
 from rtd3jax.protocols import EnvironmentLike
+from rtd3jax.system.numbers import check_count
 
 EPISODES = 8
 LONGEST_EPISODE = 1_000
@@ -76,8 +77,8 @@ def check_env(env: EnvironmentLike, *, params: object = None, seed: int = 0) -> 
         seed: seed of the episodes and actions.
 
     Raises:
-        UserError: listing every `Finding` that is not advice, with its remedy; several findings are
-            on separate lines.
+        UserError: for an impossible seed; or listing every `Finding` that is not advice, with its
+            remedy; several findings are on separate lines.
     """
     found, name = _findings(env, params, seed), environment_name(env)
     for finding in found:
@@ -104,7 +105,8 @@ def find_problems(env: EnvironmentLike, *, params: object = None, seed: int = 0)
 
 
 def _findings(env: Any, params: Any, seed: int) -> list[Finding]:
-    """All findings, advice included."""
+    """All findings, advice included; UserError for an impossible seed."""
+    check_count("seed", seed, 0)
     try:
         params = parameters_of(env, params)
     except UserError as error:
@@ -120,7 +122,9 @@ def _findings(env: Any, params: Any, seed: int) -> list[Finding]:
     assert found.interface is not None
     fleet = fleet_of(env)
     with foreign_code(), contextlib.nullcontext() if fleet is None else fleet.for_a_while():
-        return [*_whole_actions(env, params), *_played(env, params, found.interface, seed)]
+        # JAX's default type of an integer cannot hold all seeds.
+        played = _played(env, params, found.interface, np.uint32(seed))
+        return [*_whole_actions(env, params), *played]
 
 
 def _dtypes(found: Survey) -> Iterator[Finding]:
@@ -163,7 +167,7 @@ def _whole_actions(env: EnvironmentLike, params: object) -> Iterator[Finding]:
 
 
 def _played(
-    env: EnvironmentLike, params: object, interface: Interface, seed: int
+    env: EnvironmentLike, params: object, interface: Interface, seed: np.uint32
 ) -> Iterator[Finding]:
     """Finds problems that only appear when the environment is played."""
     limit = getattr(params, "max_steps_in_episode", None)
@@ -224,7 +228,7 @@ class _Record:
 
 
 def _episodes(
-    env: EnvironmentLike, params: object, interface: Interface, seed: int, steps: int
+    env: EnvironmentLike, params: object, interface: Interface, seed: np.uint32, steps: int
 ) -> _Record:
     def episode(key: jax.Array, keys: jax.Array, actions: jax.Array, params: object) -> tuple:
         first, state = env.reset(key, params)
@@ -253,7 +257,9 @@ def _episodes(
 
 
 @functools.partial(jax.jit, static_argnames="steps")
-def _draw(seed: jax.Array, low: jax.Array, high: jax.Array, steps: int) -> tuple[jax.Array, ...]:
+def _draw(
+    seed: jax.Array | np.uint32, low: jax.Array, high: jax.Array, steps: int
+) -> tuple[jax.Array, ...]:
     """Keys of resets [E] and steps [E, T], and actions [E, T, A]; compiled only once."""
     key_resets, key_steps, key_actions = jax.random.split(jax.random.key(seed), 3)
     shape = (EPISODES, steps)
@@ -308,7 +314,9 @@ def _scales(record: _Record) -> Iterator[Finding]:
         )
 
 
-def _pure(env: EnvironmentLike, params: object, record: _Record, seed: int) -> Iterator[Finding]:
+def _pure(
+    env: EnvironmentLike, params: object, record: _Record, seed: np.uint32
+) -> Iterator[Finding]:
     """Finds a reset or a step whose result changes for equal arguments."""
     state, action = _first((record.last_state, record.last_action))
 
@@ -389,7 +397,9 @@ def _final_observations(record: _Record) -> Iterator[Finding]:
         )
 
 
-def _leaks(env: EnvironmentLike, params: object, record: _Record, seed: int) -> Iterator[Finding]:
+def _leaks(
+    env: EnvironmentLike, params: object, record: _Record, seed: np.uint32
+) -> Iterator[Finding]:
     """Finds an episode that depends on the previous episode.
 
     Two different episodes end with the same key, so the automatic resets draw the same random

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from rtd3jax.envs.description import Description, Drawing
-from rtd3jax.envs.disturbed import CHANNELS, disturb
+from rtd3jax.envs.disturbed import CHANNELS, disturb, sequence
 from rtd3jax.envs.entry import own_parameters
 from rtd3jax.envs.interface import describe
 from rtd3jax.envs.parameters import settable
@@ -19,7 +19,7 @@ from rtd3jax.envs.processes.faults import (
 )
 from rtd3jax.envs.processes.process import NoDisturbance, Process
 from rtd3jax.envs.stress import SIGNAL_STRESSES, Stress, factor_stress
-from rtd3jax.errors import UserError, nearest
+from rtd3jax.errors import UserError, nearest, short_reason
 from rtd3jax.protocols import EnvironmentLike
 
 FAULT_PROCESSES: dict[str, tuple[str, Process]] = {
@@ -102,6 +102,29 @@ def check_extras(env_id: str, env: EnvironmentLike, entry: Registered) -> None:
             )
 
 
+def with_defaults(env_id: str, entry: Registered, params: object) -> EnvironmentLike:
+    """The environment that ``with_params`` makes with the default parameters ``params``.
+
+    Raises:
+        UserError: if it cannot be made, or is not equal to the registered environment: what is
+            known of an environment, such as its ceiling, is found by this equality.
+    """
+    assert entry.with_params is not None
+    try:
+        env = entry.with_params(params)
+    except UserError:
+        raise
+    except Exception as error:  # a user's function may raise any error
+        raise UserError(f"{env_id!r}: with_params failed: {short_reason(error)}") from error
+    if env != entry.env:
+        raise UserError(
+            f"{env_id!r}: with_params makes an environment that is not equal to the registered "
+            f"one, so its ceiling and drawing would be lost: let {type(entry.env).__name__} "
+            "inherit from rtd.ValueIdentity, without numeric parameters in its identity"
+        )
+    return env
+
+
 def factor_stresses(
     env_id: str, params: object, positive: Iterable[str], stresses: tuple[Stress, ...]
 ) -> tuple[Stress, ...]:
@@ -116,6 +139,16 @@ def factor_stresses(
         if names.count(name) > 1:
             raise UserError(f"{env_id!r}: two stresses are called {name!r}; rename one of them")
     return factors
+
+
+def _check_default(env_id: str, channel: str, process: Process) -> None:
+    """Raise UserError for a process that ``make`` would remove from the default parameters."""
+    if not isinstance(sequence(process), NoDisturbance):
+        raise UserError(
+            f"{env_id!r}: the default parameters have a {type(process).__name__} as {channel}, "
+            "which rtd.make would remove, because disturbances replace it: give it a name in "
+            "disturbances, and make rtd.NoDisturbance() the default"
+        )
 
 
 def named_processes(
@@ -143,6 +176,7 @@ def named_processes(
             raise UserError(f"{env_id!r}: {name} needs a process, not {process!r}")
         else:
             process.validate()
+            _check_default(env_id, channel, getattr(params, channel))
             if tried:
                 describe(env, params.replace(**{channel: process}))
         named[name] = channel, process

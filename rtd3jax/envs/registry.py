@@ -27,6 +27,7 @@ from rtd3jax.envs.registered import (
     check_extras,
     factor_stresses,
     named_processes,
+    with_defaults,
 )
 from rtd3jax.envs.stress import Stress
 from rtd3jax.errors import UserError, nearest
@@ -100,7 +101,8 @@ def register(
         disturbances: the disturbances of this environment besides "none" and ``FAULTS``: each name
             with a process of the observation, or with a pair (channel, process). A channel is one
             that `disturb` takes, or the name of a parameter of the environment that holds a
-            process and acts inside the dynamics.
+            process and acts inside the dynamics. Without a disturbance of this channel, ``make``
+            sets the parameter to ``NoDisturbance()``, so this must be its default.
         positive: parameters of the environment that must be greater than zero. `rtd3jax.robustness`
             multiplies each that is a float by 0.5 to 2.
         reward_from_observation: names of disturbances under which the environment's
@@ -114,15 +116,17 @@ def register(
         stresses: stresses of this environment for `rtd3jax.robustness`, besides those of any
             environment.
         with_params: a function that makes the environment with given default parameters, for
-            example its class. With this function, ``make`` returns an unwrapped environment if no
-            channel of `disturb` is disturbed. Without it, ``make`` always wraps the environment.
-        try_disturbances: whether to trace the environment with each disturbance now, to find
-            errors.
+            example its class; this environment must be equal to ``env`` (`rtd3jax.ValueIdentity`).
+            With this function, ``make`` returns an unwrapped environment if no channel of `disturb`
+            is disturbed. Without it, ``make`` always wraps the environment.
+        try_disturbances: whether to trace the environment with each disturbance now, and to call
+            ``with_params``, to find errors.
         replace: whether to replace an entry of another module. The ids of this package and of
             gymnax cannot be replaced.
 
     Raises:
-        UserError: for an id or a name that is taken, or an ``env`` that is not an environment.
+        UserError: for an id or a name that is taken, an ``env`` that is not an environment, or an
+            argument that does not fit it.
     """
     module = sys._getframe(1).f_globals.get("__name__", "")
     if not isinstance(env_id, str) or not env_id:
@@ -164,6 +168,8 @@ def register(
     named = named_processes(env_id, env, disturbances or {}, try_disturbances)
     entry = dataclasses.replace(entry, env=env, disturbances=named)
     check_extras(env_id, env, entry)
+    if with_params is not None and try_disturbances:
+        with_defaults(env_id, entry, own_parameters(env))
     factors = factor_stresses(env_id, own_parameters(env), entry.positive, description.stresses)
     description = dataclasses.replace(description, stresses=(*description.stresses, *factors))
     # Another id of a registered environment takes the parts that are not given from its entry.

@@ -3,11 +3,13 @@
 import numpy as np
 
 from rtd3jax.envs.description import Ceiling
+from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import environment_name
 from rtd3jax.envs.registry import description_of
 from rtd3jax.errors import UserError, short_reason
 from rtd3jax.evaluation.returns import evaluate
 from rtd3jax.protocols import EnvironmentLike
+from rtd3jax.system.numbers import check_counts, standard_error
 
 
 def ceiling(
@@ -20,12 +22,16 @@ def ceiling(
             it may be disturbed.
         episodes: number of episodes, if the ceiling is a mean over random episodes. The pendulum's
             ceiling is an integral over all starts, which needs none.
-        seed: seed of these episodes.
+        seed: seed of these episodes. The standard error of a single episode is NaN.
         env_id: the id of the environment; by default the id of an equal environment.
 
     Raises:
-        UserError: for an environment whose ceiling is not known, or when its computation fails.
+        UserError: for an unsuitable environment, impossible arguments, an environment whose ceiling
+            is not known, or when its computation fails.
     """
+    check_counts(episodes, seed)
+    parameters_of(env)
+    episodes, seed = int(episodes), int(seed)
     best_return = description_of(env, env_id).ceiling
     name = environment_name(env)
     if best_return is None:
@@ -41,4 +47,4 @@ def ceiling(
     if isinstance(best, Ceiling):
         return best
     returns = np.asarray(evaluate(best, env, episodes, seed), np.float64)
-    return Ceiling(float(returns.mean()), float(returns.std(ddof=1) / np.sqrt(episodes)), "exact")
+    return Ceiling(float(returns.mean()), standard_error(returns), "exact")

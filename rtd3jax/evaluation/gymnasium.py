@@ -11,10 +11,10 @@ from jax.typing import ArrayLike
 from rtd3jax.envs.compat.surface import within_bounds
 from rtd3jax.envs.entry import DEFAULT_STEP_LIMIT
 from rtd3jax.errors import UserError, short_reason
-from rtd3jax.evaluation.returns import check_counts
 from rtd3jax.policies.compatibility import check_compatible, fitted
 from rtd3jax.policies.trained import Policy
 from rtd3jax.protocols import PolicyLike
+from rtd3jax.system.numbers import check_counts
 from rtd3jax.system.pytrees import node_types
 
 

@@ -7,11 +7,10 @@ import jax.numpy as jnp
 
 from rtd3jax.envs.compat.simulated import release
 from rtd3jax.envs.entry import parameters_of, step_limit
-from rtd3jax.errors import UserError
-from rtd3jax.evaluation.play import begin_episodes, checked, take_step
+from rtd3jax.evaluation.play import Part, begin_episodes, checked, parts_of, take_step
 from rtd3jax.protocols import EnvironmentLike, PolicyLike
 from rtd3jax.system.jax_settings import random_key
-from rtd3jax.system.numbers import is_whole
+from rtd3jax.system.numbers import check_counts
 from rtd3jax.system.program_cache import make_room
 from rtd3jax.system.pytrees import node_types
 
@@ -30,7 +29,8 @@ def evaluate(
     Args:
         policy: anything with ``init`` and ``step``; see `rtd3jax.policies`.
         env: a gymnax >= 1.0 environment.
-        episodes: number of episodes, played together.
+        episodes: number of episodes, played together; a simulator plays at most 1,024 of them
+            together, and more of them in parts.
         seed: seed of the environment's random streams; equal seeds give equal starts and
             disturbances for all policies.
         params: the environment's parameters; its default parameters by default.
@@ -57,34 +57,39 @@ def both_returns(
     return unchecked_returns(policy, env, int(episodes), int(seed), params)
 
 
-def check_counts(episodes: int, seed: int, name_of_episodes: str = "episodes") -> None:
-    """Raise UserError for an impossible number of episodes or an impossible seed."""
-    for name, value, low in ((name_of_episodes, episodes, 1), ("seed", seed, 0)):
-        if not is_whole(value) or not low <= value < 2**32:
-            high = " and less than 2**32" if is_whole(value) and value >= low else ""
-            raise UserError(f"{name} must be an integer of at least {low}{high}, not {value!r}")
-
-
 def unchecked_returns(
     policy: PolicyLike, env: EnvironmentLike, episodes: int, seed: int, params: object
 ) -> tuple[jax.Array, jax.Array]:
     """As `both_returns`, without checks."""
     make_room()
     types = node_types((policy, params))
-    return _episode_returns(policy, env, params, random_key(seed), episodes, types)
+    key = random_key(seed)
+    played: list[tuple[jax.Array, jax.Array]] = []
+    for count, part in parts_of(env, episodes):
+        jax.block_until_ready(played)  # a part uses the simulators of the previous one
+        played.append(_episode_returns(policy, env, params, key, count, part, types))
+    if len(played) == 1:
+        return played[0]
+    returns, true_returns = (jnp.concatenate(both) for both in zip(*played, strict=True))
+    return returns, true_returns
 
 
 @functools.partial(jax.jit, static_argnames=("env", "episodes", "types"))
-def _episode_returns(policy, env, params, key, episodes, types):
-    return episode_returns(policy, env, params, key, episodes)
+def _episode_returns(policy, env, params, key, episodes, part, types):
+    return episode_returns(policy, env, params, key, episodes, part)
 
 
 def episode_returns(
-    policy: PolicyLike, env: EnvironmentLike, params: object, key: jax.Array, episodes: int
+    policy: PolicyLike,
+    env: EnvironmentLike,
+    params: object,
+    key: jax.Array,
+    episodes: int,
+    part: Part | None = None,
 ) -> tuple[jax.Array, jax.Array]:
     """As `both_returns`, float32 [episodes] each, without checks; for use under jit."""
     policy_state, env_state, observation, step_key = begin_episodes(
-        policy, env, params, key, episodes
+        policy, env, params, key, episodes, part
     )
     limit = step_limit(params)
     zeros = jnp.zeros((episodes,), jnp.float32)
@@ -97,7 +102,7 @@ def episode_returns(
         time, alive, policy_state, env_state, observation, total, true_total = loop
         action, policy_state = jax.vmap(policy.step)(policy_state, observation)
         observation, env_state, reward, terminated, truncated, info = take_step(
-            env, params, step_key, time, env_state, action
+            env, params, step_key, time, env_state, action, part
         )
         true = jnp.asarray(info.get("true_reward", reward), jnp.float32)
         total = total + jnp.where(alive, reward, 0.0)

@@ -17,10 +17,11 @@ from rtd3jax.envs.registry import description_of
 from rtd3jax.envs.stress import SIGNAL_STRESSES, Stress
 from rtd3jax.errors import UserError, nearest, short_reason
 from rtd3jax.evaluation.play import check_fits
-from rtd3jax.evaluation.returns import check_counts, unchecked_returns
+from rtd3jax.evaluation.returns import unchecked_returns
 from rtd3jax.policies.compatibility import fitted
 from rtd3jax.policies.impaired import ImpairedPolicy
 from rtd3jax.protocols import EnvironmentLike, PolicyLike
+from rtd3jax.system.numbers import check_counts, standard_error
 
 if TYPE_CHECKING:  # importing pandas takes half a second
     import pandas as pd
@@ -179,15 +180,11 @@ def rows_of(
             "quantity": case.stress.quantity,
             "value": float(case.value),
             "return": returns.mean(),
-            "standard_error": _standard_error(returns),
+            "standard_error": standard_error(returns),
             "true_return": true.mean(),
-            "true_standard_error": _standard_error(true),
+            "true_standard_error": standard_error(true),
             "episodes": episodes,
         }
-
-
-def _standard_error(returns: np.ndarray) -> float:
-    return float(returns.std(ddof=1) / np.sqrt(returns.size)) if returns.size > 1 else np.nan
 
 
 def _stress(item: str | Stress, known: Sequence[Stress], where: str) -> Stress:

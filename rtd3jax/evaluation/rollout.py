@@ -20,10 +20,10 @@ from rtd3jax.envs.interface import (
     foreign_code,
 )
 from rtd3jax.envs.registry import description_of
-from rtd3jax.evaluation.play import begin_episodes, checked, take_step
-from rtd3jax.evaluation.returns import check_counts
+from rtd3jax.evaluation.play import begin_episodes, checked, parts_of, take_step
 from rtd3jax.protocols import EnvironmentLike, PolicyLike
 from rtd3jax.system.jax_settings import random_key
+from rtd3jax.system.numbers import check_counts
 from rtd3jax.system.program_cache import make_room
 from rtd3jax.system.pytrees import node_types
 
@@ -140,7 +140,7 @@ def rollout(
         env: a gymnax >= 1.0 environment. The `Drawing` of its registration defines the names of
             elements and the hidden variable.
         seed: seed of the environment's random streams.
-        episodes: number of episodes, played together.
+        episodes: number of episodes, played together as by `rtd3jax.evaluate`.
         params: the environment's parameters; its default parameters by default.
         steps: number of steps after which episodes are cut; by default their time limit.
 
@@ -184,13 +184,18 @@ def play_episodes(
     policy = checked(policy, env, params)
     make_room()
     types = node_types((policy, params))
-    frames = _play(policy, env, params, random_key(seed), episodes, steps, hidden, types)
-    return {name: np.asarray(value) for name, value in frames.items()}
+    key, played = random_key(seed), []
+    for count, part in parts_of(env, episodes):
+        frames = _play(policy, env, params, key, count, steps, hidden, part, types)
+        played.append({name: np.asarray(value) for name, value in frames.items()})
+    if len(played) == 1:
+        return played[0]
+    return {name: np.concatenate([frames[name] for frames in played]) for name in played[0]}
 
 
 @functools.partial(jax.jit, static_argnames=("env", "episodes", "steps", "hidden", "types"))
-def _play(policy, env, params, key, episodes, steps, hidden, types):
-    memory, state, first, step_key = begin_episodes(policy, env, params, key, episodes)
+def _play(policy, env, params, key, episodes, steps, hidden, part, types):
+    memory, state, first, step_key = begin_episodes(policy, env, params, key, episodes, part)
     true = None
     if hasattr(env, "true_observation"):
         with foreign_code():
@@ -203,7 +208,7 @@ def _play(policy, env, params, key, episodes, steps, hidden, types):
         if hidden is not None:
             met = hidden(state.env if isinstance(env, Disturbed) else state)
         observation, state, reward, terminated, truncated, info = take_step(
-            env, params, step_key, time, state, action
+            env, params, step_key, time, state, action, part
         )
         seen = info["final_observation"].astype(jnp.float32)
         frame = {

@@ -9,7 +9,6 @@ import numpy as np
 import pandas as pd
 
 from rtd3jax.errors import UserError
-from rtd3jax.evaluation.returns import check_counts
 from rtd3jax.evaluation.robustness import MEASURED, Case, check_policy, make_cases, rows_of
 from rtd3jax.evaluation.robustness_plot import plot_robustness
 from rtd3jax.study.colours import ordered
@@ -19,6 +18,7 @@ from rtd3jax.study.plants import CheckedEnvironments
 from rtd3jax.study.results import CELL, LANE
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.system.files import check_writable, write_bytes_atomically
+from rtd3jax.system.numbers import check_counts
 
 FILE = "robustness.parquet"
 COLUMNS = (*CELL, "seed", *MEASURED)

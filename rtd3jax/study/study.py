@@ -16,7 +16,6 @@ from pathlib import Path
 import pandas as pd
 
 from rtd3jax.errors import UserError
-from rtd3jax.evaluation.returns import check_counts
 from rtd3jax.policies.trained import Policy
 from rtd3jax.study.ceilings import ceilings_of
 from rtd3jax.study.execute import Work
@@ -32,6 +31,7 @@ from rtd3jax.study.status import ledger
 from rtd3jax.study.tables import current_tables
 from rtd3jax.system.files import user_path
 from rtd3jax.system.interrupts import terminable
+from rtd3jax.system.numbers import check_counts
 from rtd3jax.training.lanes import workers
 from rtd3jax.training.run import check_checkpoints, check_seeds, check_strategy
 

@@ -8,12 +8,13 @@ import numpy as np
 import pandas as pd
 
 from rtd3jax.errors import UserError
-from rtd3jax.evaluation.returns import both_returns, check_counts
+from rtd3jax.evaluation.returns import both_returns
 from rtd3jax.study.plan import Cell
 from rtd3jax.study.plants import CheckedEnvironments
 from rtd3jax.study.results import LANE
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.system.files import check_writable, write_bytes_atomically
+from rtd3jax.system.numbers import check_counts
 
 FILE = "transfer.parquet"
 CELL = ["env", "algorithm", "history_length", "trained_on", "tested_on"]

@@ -387,3 +387,15 @@ def test_actions_of_whole_numbers_are_a_warning(recwarn):
     check_env(Gears())
     (warning,) = [str(w.message) for w in recwarn if w.category is UserWarning]
     assert "action_space is a Box of int32" in warning and "round the action" in warning
+
+
+@pytest.mark.parametrize("seed", [2**31, 2**32 - 1])
+def test_every_seed_is_possible(seed):
+    assert find_problems(Good(), seed=seed) == []
+
+
+@pytest.mark.parametrize("seed", [2**32, -1, 0.5, True, "0"])
+def test_an_impossible_seed_is_not_a_problem_of_the_environment(seed):
+    for check in (check_env, find_problems):
+        with pytest.raises(UserError, match="^seed must be an integer of at least 0"):
+            check(Good(), seed=seed)

@@ -243,3 +243,61 @@ def test_a_vector_that_is_declared_as_a_number_can_be_disturbed():
     env = rtd.disturb(Labelled(), rtd.GaussianNoise(sigma=0.1))
     observation, _ = env.reset(jax.random.key(0), env.default_params)
     assert env.observation_space().shape == observation.shape == (1,)
+
+
+class Kept(Tank):
+    """A tank whose default parameters are given; two objects are two environments."""
+
+    def __init__(self, params=None):
+        super().__init__()
+        self.params = params
+
+    @property
+    def default_params(self):
+        return TankParams() if self.params is None else self.params
+
+
+class Equal(rtd.ValueIdentity, Kept):
+    """Equal to any other one."""
+
+
+class Numbered(Equal):
+    """Equal to those with the same target."""
+
+    def identity(self):
+        return (self.default_params.target,)
+
+
+def unable(params):
+    raise TypeError("no tank")
+
+
+@pytest.mark.parametrize(
+    ("env", "with_params", "match"),
+    [
+        (Kept(), Kept, "not equal to the registered one, .* let Kept inherit from rtd.ValueId"),
+        (Equal(), Kept, "not equal"),
+        (Equal(), unable, "with_params failed: no tank"),
+    ],
+)
+def test_what_is_known_of_an_environment_is_not_lost_with_other_parameters(
+    tank, env, with_params, match
+):
+    with pytest.raises(rtd.UserError, match=match) as caught:
+        rtd.register("kept", env, ceiling=best_return, with_params=with_params)
+    assert "\n" not in str(caught.value) and "kept" not in registry._entries
+    best = rtd.Ceiling(-1.0, 0.0, "exact")
+    rtd.register("kept", Equal(), ceiling=lambda *_: best, with_params=Equal)
+    assert rtd.ceiling(rtd.make("kept", target=0.4), episodes=2) == best
+    rtd.register("numbered", Numbered(), ceiling=lambda *_: best, with_params=Numbered)
+    assert rtd.ceiling(rtd.make("numbered"), episodes=2) == best
+    with pytest.raises(rtd.UserError, match="without numeric parameters in its identity"):
+        rtd.make("numbered", target=0.4)
+
+
+def test_a_default_process_that_make_would_remove_is_refused(tank):
+    env = Kept(TankParams(leak=Leak(0.01)))
+    with pytest.raises(rtd.UserError, match="have a Leak as leak, .*NoDisturbance.. the default"):
+        rtd.register("kept", env, DISTURBANCES)
+    rtd.register("kept", env, {"noise": rtd.GaussianNoise()})  # no disturbance replaces the leak
+    assert rtd.make("kept", "noise").default_params.env.leak == Leak(0.01)

@@ -1,6 +1,7 @@
 """Tests the rover's optimal policy: moments, inference, and comparison with its neighbours."""
 
 import dataclasses
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -124,3 +125,27 @@ def test_other_environments_are_refused_in_one_line():
         rtd.ceiling(rtd.make("MountainCarContinuous-v0"))
     with pytest.raises(rtd.UserError, match="moments of SineSlip are not known"):
         rtd.bayes_policy(rtd.make("rover", disturbance="sine-slip"))
+
+
+def test_impossible_arguments_are_refused_and_one_episode_has_no_error():
+    env = rtd.make("rover", max_steps_in_episode=3)
+    for episodes in (0, 1.5, True):
+        with pytest.raises(rtd.UserError, match="episodes must be an integer of at least 1"):
+            rtd.ceiling(env, episodes)
+    with pytest.raises(rtd.UserError, match="seed must be an integer of at least 0"):
+        rtd.ceiling(env, seed=-1)
+    with pytest.raises(rtd.UserError, match=r"is a name, not an environment: .* rtd.make\('rover'"):
+        rtd.ceiling("rover")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for made in (env, rtd.make("rover", "sine-slip")):
+            assert np.isnan(rtd.ceiling(made, 1).standard_error)
+
+
+def test_the_bound_does_not_depend_on_the_default_generator():
+    env = rtd.make("rover", "sine-slip")
+    bound = rtd.ceiling(env, 100)
+    # The number before the package's own generator was used here.
+    assert bound.mean == pytest.approx(-0.02826312446661177, rel=1e-6)
+    with jax.default_prng_impl("rbg"):
+        assert rtd.ceiling(env, 100) == bound

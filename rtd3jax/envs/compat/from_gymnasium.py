@@ -2,11 +2,15 @@
 
 import hashlib
 import math
+import pathlib
 import pickle
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import gymnasium
+import jax
+import numpy as np
+from gymnasium.envs.registration import load_env_creator
 
 from rtd3jax.envs.compat.simulated_environment import FromGymnasium
 from rtd3jax.envs.compat.simulator import Fleet, say
@@ -42,7 +46,9 @@ def from_gymnasium(
             or else 10,000.
         step_seconds: limit of the duration of one call of the simulator, in seconds; a lane whose
             simulator exceeds it is lost.
-        **kwargs: arguments of ``gymnasium.make``, or of the function.
+        **kwargs: arguments of ``gymnasium.make``, or of the function. Two environments are equal,
+            and share compiled programs, if these have equal data, and all else in them, such as
+            functions, is the same object: with an edited function, it is another environment.
 
     Raises:
         UserError: if the environment cannot be made, or cannot be used for training.
@@ -70,12 +76,43 @@ def from_gymnasium(
     finally:
         _close(example)
     key = (env, _named(kwargs), surface.keep, surface.limit, float(step_seconds))
-    if key not in _known:
-        _known[key] = Fleet(make, read, float(step_seconds))
-    return FromGymnasium(key, title, _known[key], surface)
+    # A text cannot tell whether a function or a class of the same name is the same code.
+    code = [*(_registered(example) if isinstance(env, str) else ()), *_opaque(kwargs)]
+    made = (key, *map(id, code))
+    if made not in _known:
+        _known[made] = Fleet(make, read, float(step_seconds)), code
+    return FromGymnasium(key, title, _known[made][0], surface)
 
 
-_known: dict[tuple, Fleet] = {}
+_known: dict[tuple, tuple[Fleet, list[object]]] = {}
+"""The simulators of each environment, and the objects whose ids are in the key. The objects are
+kept so that no other object gets their ids."""
+
+_PLAIN = (type(None), bool, int, float, complex, str, bytes)
+_DATA = (np.generic, jax.Array, pathlib.PurePath)
+
+
+def _registered(example: gymnasium.Env) -> Iterator[object]:
+    """The entry of an environment's id in Gymnasium's registry, and what makes the environment."""
+    spec = gymnasium.registry.get(example.spec.id) if example.spec is not None else None
+    if spec is not None:
+        yield spec
+        if isinstance(spec.entry_point, str):
+            yield load_env_creator(spec.entry_point)
+
+
+def _opaque(value: object) -> Iterator[object]:
+    """All parts of ``value`` that are neither plain data nor arrays, such as functions.
+
+    An instance of a subclass of a plain type is not plain data, because its methods are code.
+    """
+    if isinstance(value, Iterable) and type(value) in (list, tuple, set, frozenset, dict):
+        for part in value.items() if isinstance(value, dict) else value:
+            yield from _opaque(part)
+    elif isinstance(value, np.ndarray):
+        yield from [value] if value.dtype.hasobject else []
+    elif type(value) not in _PLAIN and not isinstance(value, _DATA):
+        yield value
 
 
 def _named(kwargs: dict[str, Any]) -> str:

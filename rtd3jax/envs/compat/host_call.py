@@ -1,5 +1,6 @@
 """Calls from a compiled program to a function on the host."""
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -10,12 +11,15 @@ from jax.experimental import io_callback
 from jax.experimental.buffer_callback import Buffer, buffer_callback
 from jax.typing import ArrayLike
 
+from rtd3jax.errors import UserError
+
 
 def host_call(
     host: Callable[..., tuple],
     shapes: tuple[tuple[tuple[int, ...], Any], ...],
     due: Callable[[jax.Array], jax.Array] | None,
     *arguments: jax.Array,
+    most: int | None = None,
 ) -> tuple[jax.Array, ...]:
     """Call a function on the host from a compiled program.
 
@@ -27,6 +31,10 @@ def host_call(
         due: a function of the first argument, with the axes of vmap, that returns a bool []. If it
             is false, ``host`` is not called, and the results are zeros. None means always true.
         *arguments: the arguments of ``host``.
+        most: the largest number of simulators, if each member under vmap needs one.
+
+    Raises:
+        UserError: for more members, when the program is traced.
     """
     arguments = tuple(map(jnp.asarray, arguments))
     ranks = [argument.ndim for argument in arguments]
@@ -47,6 +55,7 @@ def host_call(
     @jax.custom_batching.custom_vmap
     def call(*given: jax.Array) -> tuple[jax.Array, ...]:
         lead = given[0].shape[: given[0].ndim - ranks[0]]
+        _check_members(math.prod(lead), most)
         results = tuple(jax.ShapeDtypeStruct((*lead, *shape), dtype) for shape, dtype in shapes)
 
         def ask(*given: jax.Array) -> tuple[jax.Array, ...]:
@@ -69,6 +78,18 @@ def host_call(
         return call(*wide), tuple(True for _ in shapes)
 
     return call(*arguments)
+
+
+def _check_members(members: int, most: int | None) -> None:
+    """Raise UserError for more members than simulators.
+
+    Each step would take the simulators of other members, and replay all episodes from their start.
+    """
+    if most is not None and members > most:
+        raise UserError(
+            f"simulators play at most {most:,} episodes together, not {members:,}: lower "
+            "eval_episodes or environments, or vmap over fewer keys"
+        )
 
 
 def _ask(

@@ -48,6 +48,10 @@ class FromGymnasium(ValueIdentity, environment.Environment):
         """The arguments with which it was made."""
         return self._key
 
+    def _identity(self) -> tuple:
+        # `identity` is also stored in files. In this process, the simulators stand for the code.
+        return (*super()._identity(), self.fleet)
+
     @property
     def name(self) -> str:
         """The id, or the name of the function that makes the environment."""
@@ -101,7 +105,7 @@ class FromGymnasium(ValueIdentity, environment.Environment):
         seed = jax.random.bits(key, (), jnp.uint32) >> jnp.uint32(1)
         shapes = ((), jnp.int32), ((len(self._surface.keep),), jnp.float32), ((2,), jnp.uint32)
         handle, observation, digest = host_call(
-            self._reset, shapes, jnp.any, where, state.handle, seed
+            self._reset, shapes, jnp.any, where, state.handle, seed, most=self.fleet.most
         )
         return observation, state.replace(
             time=jnp.int32(0),
@@ -135,7 +139,7 @@ class FromGymnasium(ValueIdentity, environment.Environment):
         # XLA may compute an action twice, with different rounding. So the host returns the action
         # that it received, and the state stores it.
         handle, observation, reward, terminated, truncated, digest, action = host_call(
-            self._step, shapes, None, *place, action, state.actions
+            self._step, shapes, None, *place, action, state.actions, most=self.fleet.most
         )
         actions = jax.lax.dynamic_update_slice(
             state.actions, action[None], (state.time, jnp.int32(0))

@@ -335,6 +335,11 @@ class Fleet:
             simulator.close()
 
     @property
+    def most(self) -> int:
+        """Limit of the simulators in use, and so of the episodes that are played together."""
+        return MOST
+
+    @property
     def count(self) -> int:
         """Number of open simulators."""
         with self._lock:

@@ -18,6 +18,7 @@ _PARAMETERS = (
     *("log", "channel", "columns", "episode", "period", "step", "bounds", "elements"),
     *("independent", "mirror"),
 )
+_LEAVES = {"values", "begins", "lengths", "low", "high"}
 PLAYED_ON = ("observation", "action", "reward", "slip")
 MOST_ROWS = 2**31 - 1
 """Rows of all recordings, at most: rows are counted with int32."""
@@ -108,17 +109,20 @@ class Recorded(Process):
             mirror: replay a recording that is shorter than an episode to its end, then backwards,
                 and so on. Without this option, short recordings are never replayed, and a log with
                 only short recordings is refused.
-            **fields: the fields of an existing instance; `replace` passes them.
+            **fields: the fields of an existing instance; `replace` passes them, and takes all other
+                arguments except those of the reading: the log, columns, episode, period and step.
 
         Raises:
             UserError: for a log that cannot be read or replayed.
         """
         if fields:
-            if log is not None or set(fields) != {"values", "begins", "lengths", "low", "high"}:
-                raise UserError(
-                    f"Recorded has no parameter {sorted(fields)[0]!r}"
-                    f"{nearest(sorted(fields)[0], _PARAMETERS)}"
-                )
+            unknown = sorted(fields.keys() - _LEAVES)
+            if unknown or fields.keys() != _LEAVES:
+                name = (unknown or sorted(fields))[0]
+                raise UserError(f"Recorded has no parameter {name!r}{nearest(name, _PARAMETERS)}")
+            _refuse_reading(log=log, columns=columns, episode=episode, period=period, step=step)
+            if bounds is not None:
+                fields["low"], fields["high"] = _bounds(bounds)
         else:
             if log is None:
                 raise UserError("Recorded needs a log: a CSV or Parquet file, or an array [T, N]")
@@ -133,7 +137,7 @@ class Recorded(Process):
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
-        if log is not None:
+        if log is not None or bounds is not None:
             self.validate()
 
     def init(self, key: jax.Array, horizon: int | jax.Array, size: int) -> RecordedState:
@@ -320,6 +324,16 @@ class Recorded(Process):
             f"Recorded({self.lengths.shape[-1]} recordings, {self.values.shape[-2]:,} rows of "
             f"{self.values.shape[-1]}, channel={self.channel!r})"
         )
+
+
+def _refuse_reading(**arguments: object) -> None:
+    """Raise UserError for an argument that acts when a log is read, but is given to `replace`."""
+    for name, value in arguments.items():
+        if value is not None:
+            raise UserError(
+                f"Recorded: {name} only acts when a log is read, so it cannot be replaced: read "
+                "the log again with rtd.Recorded(log, ...)"
+            )
 
 
 def _leaves(stretches: Sequence[np.ndarray]) -> dict[str, np.ndarray]:

@@ -22,6 +22,8 @@ from rtd3jax.envs.rover.slip import WHEELS, Ar1Slip, SineSlip
 from rtd3jax.envs.rover.task import limits, sides
 from rtd3jax.errors import UserError
 from rtd3jax.protocols import EnvironmentLike
+from rtd3jax.system.jax_settings import random_key
+from rtd3jax.system.numbers import standard_error
 
 
 class BayesState(NamedTuple):
@@ -107,7 +109,7 @@ def _sine_bound(params: RoverParams, episodes: int, seed: int) -> Ceiling:
     At the first step nothing has been observed, so no policy is better at this step than the best
     constant command under the prior.
     """
-    keys = jax.random.split(jax.random.key(seed), episodes)
+    keys = jax.random.split(random_key(seed), episodes)
     horizon = params.max_steps_in_episode
     slip = jax.vmap(lambda key: params.slip.init(key, horizon, WHEELS).slip)(keys)
     traction = 1.0 - slip
@@ -117,9 +119,7 @@ def _sine_bound(params: RoverParams, episodes: int, seed: int) -> Ceiling:
     yaw_rate = (realised[:, 1] - realised[:, 0]) / params.wheelbase
     losses = (speed - params.target_speed) ** 2 + (yaw_rate - params.target_yaw_rate) ** 2
     returns = -np.asarray(losses, np.float64)
-    return Ceiling(
-        float(returns.mean()), float(returns.std(ddof=1) / np.sqrt(episodes)), "upper bound"
-    )
+    return Ceiling(float(returns.mean()), standard_error(returns), "upper bound")
 
 
 def _inferred_slip(params: RoverParams, state: BayesState, observation: jax.Array) -> jax.Array:

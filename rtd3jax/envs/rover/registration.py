@@ -1,5 +1,8 @@
 """Registers the rover with its disturbances, baselines, ceiling, drawing and stresses."""
 
+import functools
+import operator
+
 import jax
 
 from rtd3jax.envs.controllers import PIDPolicy
@@ -24,9 +27,18 @@ def feedforward_pi(env: EnvironmentLike) -> PIDPolicy | None:
 
 
 def next_slip(state: RoverState) -> jax.Array | None:
-    """The slip [..., 2] that acts in the next step; None if no state has a field ``slip``."""
+    """The slip [..., 2] that acts in the next step; None if no state has a field ``slip``.
+
+    Several slips act in sequence, so their tractions, one minus the slip, are multiplied. The
+    result is None if one of them only acts on one wheel, because its state does not state which.
+    """
     parts = state.slip if type(state.slip) is tuple else (state.slip,)
-    return next((part.slip for part in parts if hasattr(part, "slip")), None)
+    slips = [part.slip for part in parts if hasattr(part, "slip")]
+    if len(slips) < 2:
+        return slips[0] if slips else None
+    if any(slip.shape != slips[0].shape for slip in slips):
+        return None
+    return 1.0 - functools.reduce(operator.mul, [1.0 - slip for slip in slips])
 
 
 def _constant_slip(params: RoverParams, slip: float) -> RoverParams:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import sys
 import time
 import warnings
 from types import SimpleNamespace
@@ -11,8 +12,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from gymnasium.envs.registration import EnvSpec
 
 import rtd3jax as rtd
+from rtd3jax.envs.compat import simulator
+from rtd3jax.envs.compat.simulated import simulated_identity
 from rtd3jax.envs.compat.simulator import Fault, Simulator, close_simulators, fault_of
 from rtd3jax.envs.compat.simulator_state import simulator_handles
 from rtd3jax.envs.compat.surface import surface_of
@@ -42,6 +46,7 @@ class Cart(gymnasium.Env):
     action_space = gymnasium.spaces.Box(np.float32([-1, -3]), np.float32([2, 3]))
     made = 0
     closed = 0
+    begun = 0
 
     def __init__(self, fault=None, at=10, noise=False, lost=()):
         type(self).made += 1
@@ -55,6 +60,7 @@ class Cart(gymnasium.Env):
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         assert seed is not None
+        type(self).begun += 1
         self.x, self.v, self.time = self.np_random.uniform(-0.5, 0.5), 0.0, 0
         return self.seen(), {}
 
@@ -463,3 +469,105 @@ def test_actions_of_whole_numbers_are_rounded():
     surface = surface_of(example, "whole", None, 5)[0]
     for action, sent in ((0.6, 1), (-0.6, -1), (0.4, 0), (1.99, 2), (9.0, 2)):
         np.testing.assert_array_equal(surface.command(np.full(2, action, np.float32)), sent)
+
+
+class Shaped(Cart):
+    """The reward is that of a function."""
+
+    def __init__(self, shaping):
+        super().__init__()
+        self.shaping = shaping
+
+    def step(self, action):
+        seen, _, _, truncated, info = super().step(action)
+        return seen, self.shaping(), False, truncated, info
+
+
+def shaping():
+    """A function that `pickle` stores by its name."""
+    return 1.0
+
+
+def another(reward):
+    """A function of the same name, as an edited cell of a notebook defines it."""
+
+    def shaping():
+        return reward
+
+    shaping.__qualname__ = "shaping"
+    return shaping
+
+
+@pytest.mark.parametrize("given", [lambda f: f, lambda f: {"by": [f, 2.0]}])
+def test_an_edited_function_is_another_environment(monkeypatch, given):
+    def make(shaping):
+        return Shaped(shaping if callable(shaping) else shaping["by"][0])
+
+    policy, made = rtd.constant_policy([0.1, 0.1]), []
+    for reward in (1.0, 2.0):
+        monkeypatch.setattr(sys.modules[__name__], "shaping", another(reward))
+        made += [
+            rtd.from_gymnasium(make, max_steps_in_episode=3, shaping=given(shaping))
+            for _ in range(2)
+        ]
+        assert made[-1] == made[-2] and hash(made[-1]) == hash(made[-2])
+        np.testing.assert_array_equal(rtd.evaluate(policy, made[-1], 1), [3.0 * reward])
+    assert made[0] != made[2]
+    assert simulated_identity(made[0]) == simulated_identity(made[2])  # files know the name only
+    close_simulators()
+
+
+class Changed(Cart):
+    """The class after it was edited."""
+
+
+def test_an_id_that_is_registered_again_is_another_environment(monkeypatch):
+    def register(entry_point):
+        spec = EnvSpec("Cart-v0", entry_point, max_episode_steps=12)
+        monkeypatch.setitem(gymnasium.registry, "Cart-v0", spec)
+        return rtd.from_gymnasium("Cart-v0")
+
+    def plays(env):
+        _, state = env.reset(jax.random.key(0), env.default_params)
+        simulator = env.fleet._busy[int(state.handle)]
+        env.fleet.release(int(state.handle))  # it is free for the next episode
+        return type(simulator._env.unwrapped)
+
+    first = register(Cart)
+    assert first == rtd.from_gymnasium("Cart-v0") and plays(first) is Cart
+    second = register(Changed)
+    assert first != second and plays(second) is Changed
+    assert simulated_identity(first) == simulated_identity(second)
+    third = register(f"{__name__}:Shown")
+    assert plays(third) is Cart
+    monkeypatch.setattr(sys.modules[__name__], "Shown", Changed)
+    fourth = rtd.from_gymnasium("Cart-v0")
+    assert third != fourth and plays(fourth) is Changed
+    close_simulators()
+
+
+Shown = Cart
+
+
+def test_more_episodes_than_simulators_are_played_in_parts(monkeypatch):
+    env = rtd.disturb(environment(), rtd.GaussianNoise(0.1))
+    fleet, policy = env.base.fleet, rtd.random_policy(env)
+
+    def play():
+        close_simulators()
+        played = rtd.rollout(policy, env, seed=2, episodes=3)
+        return rtd.evaluate(policy, env, 3, seed=2), played.seen, played.actions, played.lengths
+
+    begun = Cart.begun
+    whole, once = play(), Cart.begun - begun
+    assert fleet.count == 3
+    monkeypatch.setattr(simulator, "MOST", 2)
+    before, begun = Cart.made, Cart.begun
+    for one, other in zip(whole, play(), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert fleet.count == Cart.made - before == 2
+    assert Cart.begun - begun <= once  # no episode is replayed
+    keys = jax.random.split(jax.random.key(0), 3)
+    with pytest.raises(rtd.UserError, match="play at most 2 episodes together, not 3: lower"):
+        jax.vmap(env.reset, (0, None))(keys, env.default_params)
+    close_simulators()

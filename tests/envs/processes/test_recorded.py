@@ -84,6 +84,23 @@ def test_bounds_and_elements():
     assert process.output_size(3) == 3
 
 
+def test_bounds_are_replaced_and_the_reading_is_not():
+    log = np.linspace(-2.0, 2.0, 41)
+    wide = rtd.Recorded(log)
+    bounded = wide.replace(bounds=(-1.0, 0.5))
+    assert bounded == rtd.Recorded(log, bounds=(-1.0, 0.5)) != wide
+    assert bounded.replace(mirror=True).low == -1.0
+    with pytest.raises(UserError, match="low=1.0 is greater than high=0.0"):
+        wide.replace(bounds=(1.0, 0.0))
+    reading = {"log": log, "columns": ["a"], "episode": "run", "period": 0.1, "step": 0.2}
+    for name, value in reading.items():
+        with pytest.raises(UserError, match=f"{name} only acts when a log is read, .* read") as one:
+            wide.replace(**{name: value})
+        assert "\n" not in str(one.value)
+    with pytest.raises(UserError, match="no parameter 'miror'; did you mean 'mirror'"):
+        wide.replace(miror=True)
+
+
 def test_slip_acts_as_the_rovers_own(tmp_path):
     slip = np.random.default_rng(0).uniform(0.0, 0.5, (20, 2))
     env = Rover(RoverParams(slip=rtd.Recorded(slip, channel="slip"), max_steps_in_episode=STEPS))

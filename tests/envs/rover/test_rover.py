@@ -5,9 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import rtd3jax as rtd
 from rtd3jax.envs.builtin import DISTURBANCES
 from rtd3jax.envs.registered import FAULTS
 from rtd3jax.envs.registry import make
+from rtd3jax.envs.rover.registration import next_slip
+from rtd3jax.envs.rover.slip import Ar1SlipState
 
 STEPS = 200
 
@@ -165,3 +168,18 @@ def test_time_limit_truncates_and_the_new_episode_has_a_new_slip():
     np.testing.assert_array_equal(observation, [-0.5, 0.0])
     assert int(state.time) == 0
     assert np.max(np.abs(np.asarray(state.slip.slip) - 0.95 * slip)) > 1e-3
+
+
+def test_the_hidden_slip_of_joined_slips_is_that_of_the_motion():
+    env = make("rover", "sine-slip+ar1-slip-fast+ar1-slip", max_steps_in_episode=20)
+    played = rtd.rollout(rtd.constant_policy([0.5, 0.2]), env, seed=1)
+    errors = oracle(played.actions, played.hidden)
+    np.testing.assert_allclose(errors, played.true[:, 1:], atol=2e-6)
+
+
+def test_the_hidden_slip_of_one_process_is_its_own():
+    _, state = make("rover", "ar1-slip").reset(jax.random.key(0))
+    assert next_slip(state) is state.slip.slip
+    joined = state.replace(slip=(state.slip, Ar1SlipState(jnp.ones(1))))
+    assert next_slip(joined) is None  # a slip of one wheel, but it is not known of which
+    assert next_slip(state.replace(slip=())) is None
