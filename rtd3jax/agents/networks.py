@@ -12,6 +12,7 @@ import chex
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from flax.errors import FlaxError
 
 from rtd3jax.agents.history import History, Segment, Steps, Window, flat
 from rtd3jax.agents.memory.base import Carry, Memory, Params, check_memory
@@ -389,14 +390,22 @@ def _example(module: nn.Module, batch: int) -> jax.Array:
 def _check_encoder(module: nn.Module, width: int) -> None:
     """Raise UserError, before anything is compiled, if the encoder violates its interface."""
     name = type(module).__name__
+
+    def applied() -> Any:
+        # As in training: with the parameters alone, and not with all that `init` makes.
+        params = _initial(module, jax.random.key(0))
+        return module.apply({"params": params}, _example(module, 2))
+
     try:
-        given = jax.eval_shape(
-            lambda: module.init_with_output(jax.random.key(0), _example(module, 2))[0]
-        )
+        given = jax.eval_shape(applied)
     except Exception as error:  # code of a user, which may raise any error
-        raise UserError(f"encoder {name} failed: {short_reason(error)}") from error
-    if (given.shape, given.dtype) != ((2, width), jnp.float32):
+        remedy = ""
+        if isinstance(error, FlaxError):
+            remedy = "; an encoder may only use parameters, no other variables or random numbers"
+        raise UserError(f"encoder {name} failed: {short_reason(error)}{remedy}") from error
+    if (getattr(given, "shape", None), getattr(given, "dtype", None)) != ((2, width), jnp.float32):
         raise UserError(
             f"encoder {name} must return float32 [batch, {width}], not "
-            f"{given.dtype}{list(given.shape)} for a batch of 2"
+            f"{getattr(given, 'dtype', type(given).__name__)}"
+            f"{list(getattr(given, 'shape', []))} for a batch of 2"
         )

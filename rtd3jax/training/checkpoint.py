@@ -8,6 +8,7 @@ if the process may use the same number of cores on the same kind of processor: X
 by this number. Otherwise it differs by rounding.
 """
 
+import contextlib
 import json
 import re
 import tempfile
@@ -23,7 +24,7 @@ import numpy as np
 
 from rtd3jax.envs.compat.simulated import release
 from rtd3jax.errors import UserError
-from rtd3jax.system.files import read_arrays, write_arrays
+from rtd3jax.system.files import read_arrays, read_metadata, write_arrays
 from rtd3jax.system.jax_settings import jax_settings
 from rtd3jax.system.versions import versions_of
 from rtd3jax.training.loop import Lane, LaneState, Program
@@ -115,6 +116,16 @@ class Checkpoints:
         stale = [old for old in before if old not in earlier[: kept - 1]]
         for old in [*stale, *_unfinished(directory)]:
             old.unlink(missing_ok=True)
+
+    def check(self, job: Any) -> None:
+        """Raise UserError if the lane's newest checkpoint belongs to another identity.
+
+        `restore` raises it too, but in a worker, while other lanes train. Only metadata are read
+        here; damaged files are left to `restore`.
+        """
+        newest = newest_metadata(self._directory_of(job))
+        if newest is not None:
+            self._check(*newest, job)
 
     def prepare(self, jobs: Iterable[Any]) -> None:
         """Make the directory of each lane, and raise UserError if it cannot be written."""
@@ -292,6 +303,26 @@ def why_not_longer(before: Mapping[str, Any], after: Mapping[str, Any], step: in
 def versions() -> dict[str, str]:
     """Versions of the packages, which also determine a lane's results."""
     return versions_of(("rtd3jax", "jax", "jaxlib"))
+
+
+def lane_directory(directory: Path, seed: int) -> Path:
+    """The directory of a lane's checkpoints in the ``checkpoint_dir`` of a configuration."""
+    return directory / f"seed-{seed}"
+
+
+def newest_metadata(directory: Path) -> tuple[Path, Any] | None:
+    """The newest checkpoint in a lane's directory whose metadata can be read, and these."""
+    for file in checkpoint_files(directory):
+        with contextlib.suppress(UserError):
+            return file, read_metadata(file)
+    return None
+
+
+def identity_there(directory: Path) -> dict[str, Any]:
+    """The identity in the newest readable checkpoint in a lane's directory; empty without one."""
+    _, metadata = newest_metadata(directory) or (None, None)
+    identity = metadata.get("identity") if isinstance(metadata, dict) else None
+    return identity if isinstance(identity, dict) else {}
 
 
 def checkpoint_steps(directory: Path) -> list[int]:

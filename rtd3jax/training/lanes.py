@@ -230,7 +230,8 @@ def advance_groups(
     If a group raises an error, the group keeps it, and the other groups continue. After an
     interrupt, the workers finish their current chunks, and the interrupt is raised again. With
     ``checkpoints``, groups continue from their checkpoints, and write new ones at intervals; at the
-    end or after an interrupt, each group whose ``state`` is not None has one at its last step.
+    end or after an interrupt, each group whose ``state`` is not None has one at its last step. If
+    another interrupt ends the wait for the workers, their groups keep the checkpoints they had.
     If a checkpoint cannot be written then, the others are written before the error is raised.
     ``devices`` has a device for each worker, by default those of `workers`.
     """
@@ -254,8 +255,11 @@ def advance_groups(
     finally:
         if checkpoints is not None:
             with patient(_ENDING):
+                pool.stop()  # an interrupt may have come before the first call
+                given_back = (group for group in groups if not pool.is_held(group))
                 # A group that has ended, but is not recorded yet, still has its state.
-                checkpoints.save_all(g for g in groups if g.state is not None and g.error is None)
+                kept = (g for g in given_back if g.state is not None and g.error is None)
+                checkpoints.save_all(kept)
 
 
 @contextlib.contextmanager
@@ -278,8 +282,8 @@ class _Pool:
 
     def __init__(self, groups: Sequence[Group]):
         self._idle = [group for group in groups if not group.finished]
-        self._busy: list[Any] = []
-        """The device of each group that a worker advances."""
+        self._held: list[Group] = []
+        """The groups that workers advance."""
         cells = list(dict.fromkeys(id(group.jobs[0].cell) for group in groups))
         self._rank = {
             id(group): (group.wave, cells.index(id(group.jobs[0].cell))) for group in groups
@@ -298,18 +302,27 @@ class _Pool:
         """
         with self._changed:
             while (group := self._next(device)) is None:
-                if self._stopped or not (self._idle or self._busy):
+                if self._stopped or not (self._idle or self._held):
                     return None
                 self._changed.wait()
             self._idle.remove(group)
-            self._busy.append(device)
+            self._held.append(group)
             group.device = device
             return group
+
+    def is_held(self, group: Group) -> bool:
+        """Whether a worker advances the group: its state is then in use, and may be gone.
+
+        After `stop`, no worker takes another group.
+        """
+        with self._changed:
+            return group in self._held
 
     def _next(self, device: Any) -> Group | None:
         """The group to advance next on the device; None if there is none yet."""
         here = (None, device)
-        ready = [g for g in self._idle if g.device in here or g.device in self._busy]
+        busy = [held.device for held in self._held]
+        ready = [g for g in self._idle if g.device in here or g.device in busy]
         if not ready or self._stopped:
             return None
         # One cell after the other, so that results come early and few replays are in memory;
@@ -322,7 +335,7 @@ class _Pool:
 
     def give_back(self, group: Group) -> None:
         with self._changed:
-            self._busy.remove(group.device)
+            self._held.remove(group)
             (self._unhandled if group.finished else self._idle).append(group)
             self._events.append(group)
             self._changed.notify_all()
@@ -332,7 +345,7 @@ class _Pool:
         while True:
             with self._changed:
                 while not self._events:
-                    if not self._idle and not self._busy:
+                    if not self._idle and not self._held:
                         return
                     # With a timeout, so that an interrupt reaches the main thread.
                     self._changed.wait(timeout=0.2)

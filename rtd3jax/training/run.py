@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import hashlib
 import os
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, overload
@@ -21,7 +22,7 @@ from rtd3jax.protocols import EnvironmentLike
 from rtd3jax.system.files import user_path
 from rtd3jax.system.numbers import is_whole
 from rtd3jax.system.switches import check_compiling
-from rtd3jax.training.checkpoint import Checkpoints
+from rtd3jax.training.checkpoint import Checkpoints, lane_directory
 from rtd3jax.training.feasibility import check_segments, warn_if_untrained
 from rtd3jax.training.lanes import (
     Group,
@@ -42,7 +43,7 @@ from rtd3jax.training.loop import (
 )
 from rtd3jax.training.plant import plant_of
 from rtd3jax.training.progress import Progress
-from rtd3jax.training.start import IN_MEMORY, Start, starts_of_path
+from rtd3jax.training.start import IN_MEMORY, Start, starts_of_path, starts_or_why_not
 
 _REASONS = {
     ENVIRONMENT_NOT_FINITE: "the environment returned an observation or reward that is not finite; "
@@ -170,7 +171,8 @@ def train(
             longer if checkpoints would take more than 2% of the time.
         start: networks from which training starts: a `Policy`, a `Run` with the same seeds, the
             file of a saved policy, or the ``checkpoint_dir`` of another training, which also holds
-            critics and optimisers. See also ``freeze`` and ``actor_starts`` of `Config`.
+            critics and optimisers. A lane that continues from a checkpoint does not need the file
+            or directory any more. See also ``freeze`` and ``actor_starts`` of `Config`.
         strategy: ``map`` (lanes one after the other, each on one core) or ``vmap`` (one batched
             program); by default ``map`` on a CPU and ``vmap`` on an accelerator.
 
@@ -178,7 +180,10 @@ def train(
         The run; for several configurations, a list of runs in their order.
 
     Raises:
-        UserError: for an unsuitable environment or impossible arguments, before compilation.
+        UserError: for an unsuitable environment, impossible arguments or checkpoints of another
+            training, before compilation.
+        Exception: an error in a lane; at once, or with ``checkpoint_dir`` when the other lanes have
+            ended, whose checkpoints are then complete.
     """
     single = isinstance(config, Config)
     configs = [config] if isinstance(config, Config) else as_list(config)
@@ -186,8 +191,12 @@ def train(
         raise UserError(f"config must be an rtd.Config, or several of them, not {config!r}")
     seeds = check_seeds(seeds)
     check_checkpoints(checkpoint_dir, checkpoint_seconds)
+    directories = _directories(checkpoint_dir, None if single else len(configs))
     sources = [start if start is not None else one.start or None for one in configs]
-    starts = [_starts(source, seeds) for source in sources]
+    starts = [
+        _starts(source, seeds, directories[index] if directories else None)
+        for index, source in enumerate(sources)
+    ]
     configs = [
         dataclasses.replace(one, start=_start_field(source, own[seeds[0]])) if own else one
         for one, source, own in zip(configs, sources, starts, strict=True)
@@ -198,13 +207,13 @@ def train(
         for job in make_jobs(env, one, seeds, params=params, cell=index, starts=own)
     ]
     checkpoints = None
-    if checkpoint_dir is not None:
-        directory = user_path(checkpoint_dir)
-        parts = [directory] if single else [directory / f"config-{k}" for k in range(len(configs))]
-        checkpoints = _checkpoints(parts, configs, env, checkpoint_seconds)
+    if directories:
+        checkpoints = _checkpoints(directories, configs, env, checkpoint_seconds)
     strategy, remark = check_strategy(strategy), "" if checkpoints is not None else _NO_CHECKPOINTS
     check_starts(jobs, checkpoints)
     if checkpoints is not None:
+        for job in jobs:
+            checkpoints.check(job)
         checkpoints.prepare(
             job for job in jobs if job.program.config.total_steps not in checkpoints.steps(job)
         )
@@ -220,12 +229,14 @@ def train(
 
         def on_chunk(group: Group) -> None:
             bar.update(group)
+            if group.error is not None and checkpoints is None:
+                raise group.error  # it ends the training: nothing would keep the other lanes
             # An event may arrive after the one at which the group was collected.
             if not group.finished or group.error is not None or group.state is None:
                 return
             # Other lanes may train for hours before this call ends.
             if checkpoints is not None:
-                checkpoints.save_once(group)
+                _save_ended(group, checkpoints)
             for job, state in group.lanes():
                 lanes[job.key] = job, _without_replay(state)
             group.state = None
@@ -239,6 +250,27 @@ def train(
         for index, one in enumerate(configs)
     ]
     return runs[0] if single else runs
+
+
+def _save_ended(group: Group, checkpoints: Checkpoints) -> None:
+    """Write checkpoints of a group that has ended; a full disk does not end the training."""
+    try:
+        checkpoints.save_once(group)
+    except UserError as error:
+        warnings.warn(
+            f"{error}; the result is kept in memory only: save the policies when the training ends",
+            stacklevel=2,
+        )
+
+
+def _directories(checkpoint_dir: str | Path | None, configs: int | None) -> list[Path]:
+    """The directory of checkpoints of each configuration, None for a single one; none without."""
+    if checkpoint_dir is None:
+        return []
+    directory = user_path(checkpoint_dir)
+    if configs is None:
+        return [directory]
+    return [directory / f"config-{index}" for index in range(configs)]
 
 
 def _checkpoints(
@@ -255,7 +287,9 @@ def _checkpoints(
         own = {"start": job.start.where} if job.start is not None else {}
         return {**configs[index].to_dict(), **own, **plant(job), "seed": seed}
 
-    return Checkpoints(lambda job: directories[job.cell] / f"seed-{job.seed}", identity, seconds)
+    return Checkpoints(
+        lambda job: lane_directory(directories[job.cell], job.seed), identity, seconds
+    )
 
 
 def _without_replay(state: LaneState) -> LaneState:
@@ -322,8 +356,13 @@ def _start_field(source: StartLike, start: Start) -> str:
     return str(user_path(source)) if isinstance(source, str | Path) else start.where
 
 
-def _starts(start: StartLike, seeds: tuple[int, ...]) -> dict[int, Start]:
-    """The networks from which each seed starts; empty for new weights."""
+def _starts(
+    start: StartLike, seeds: tuple[int, ...], directory: Path | None = None
+) -> dict[int, Start]:
+    """The networks from which each seed starts; empty for new weights.
+
+    ``directory`` has the checkpoints of the seeds, None without checkpoints.
+    """
     if start is None:
         return {}
     if isinstance(start, Policy):
@@ -333,7 +372,9 @@ def _starts(start: StartLike, seeds: tuple[int, ...]) -> dict[int, Start]:
     if isinstance(start, Run):
         return {seed: _starts(start.policy(seed), (seed,))[seed] for seed in seeds}
     if isinstance(start, str | Path):
-        return starts_of_path(start, seeds)
+        if directory is None:
+            return starts_of_path(start, seeds)
+        return starts_or_why_not(start, {seed: lane_directory(directory, seed) for seed in seeds})
     raise UserError(
         "start must be a policy, a run of rtd.train, the path of a saved policy, or a directory "
         f"of checkpoints, not {start!r}"

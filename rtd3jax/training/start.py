@@ -21,7 +21,12 @@ from rtd3jax.errors import UserError
 from rtd3jax.policies.serialization import read_policy
 from rtd3jax.policies.trained import Policy
 from rtd3jax.system.files import read_arrays, user_path
-from rtd3jax.training.checkpoint import checkpoint_files, leaves_from_arrays
+from rtd3jax.training.checkpoint import (
+    checkpoint_files,
+    identity_there,
+    lane_directory,
+    leaves_from_arrays,
+)
 from rtd3jax.training.loop import HEALTHY, Lane, LaneState, Program
 
 KNOWN_OBSERVATIONS = 1_000
@@ -83,9 +88,10 @@ class Start:
         if policy.normaliser is not None:
             statistics = _statistics_of(policy.normaliser)
         learner = state.learner
-        # Copies: a lane's buffers are donated, but the owner of the policy keeps using it.
+        # Copies: a lane's buffers are donated, but the owner of the policy keeps using it. On no
+        # fixed device: policies of several devices may start lanes of one group.
         names = [name for name in ("actor", "target_actor") if hasattr(learner, name)]
-        parts = {name: jax.tree.map(jnp.array, policy.actor) for name in names}
+        parts = {name: jax.tree.map(_copy, policy.actor) for name in names}
         learner = dataclasses.replace(learner, **parts)
         return dataclasses.replace(state, learner=learner, statistics=statistics)
 
@@ -177,18 +183,50 @@ def starts_of_path(path: str | Path, seeds: tuple[int, ...]) -> dict[int, Start]
         )
     found = {}
     for seed in seeds:
-        files = checkpoint_files(path / f"seed-{seed}")
+        files = checkpoint_files(lane_directory(path, seed))
         if not files:
             raise UserError(
                 f"{path} is no saved policy, and has no checkpoint of seed {seed} to start from"
             )
-        found[seed] = Start(f"{path} seed {seed}", checkpoint=files[0])
+        found[seed] = Start(_lane_name(path, seed), checkpoint=files[0])
     return found
+
+
+def starts_or_why_not(path: str | Path, directories: Mapping[int, Path]) -> dict[int, Start]:
+    """`starts_of_path` for each seed of ``directories``, which may hold checkpoints of its lane.
+
+    A lane with checkpoints that began from ``path`` does not need it any more: if it cannot be
+    read, the start of this lane only has a name.
+
+    Raises:
+        UserError: as `starts_of_path` does, for any other lane.
+    """
+    found: dict[int, Start] = {}
+    for seed, directory in directories.items():
+        try:
+            found |= starts_of_path(path, (seed,))
+        except UserError as error:
+            where = identity_there(directory).get("start")
+            # The lane may have begun from something else, which its checkpoints would refuse.
+            if where not in (str(user_path(path)), _lane_name(user_path(path), seed)):
+                raise
+            found[seed] = Start(where, missing=str(error))
+    return found
+
+
+def _lane_name(path: Path, seed: int) -> str:
+    """The name of a start from the lane of ``seed`` in the ``checkpoint_dir`` ``path``."""
+    return f"{path} seed {seed}"
 
 
 def _statistics_of(normaliser: Normaliser) -> Statistics:
     return Statistics(
         jnp.int32(KNOWN_OBSERVATIONS),
-        jnp.array(normaliser.mean),
-        1.0 / jnp.square(normaliser.scale),
+        _copy(normaliser.mean),
+        1.0 / jnp.square(_copy(normaliser.scale)),
     )
+
+
+def _copy(array: jax.Array) -> jax.Array:
+    """A copy on JAX's default device; `jnp.array` alone would stay on the device of ``array``."""
+    return jnp.array(np.asarray(array))

@@ -1,5 +1,9 @@
 """Compares the six agents' networks with the paper's tables and a separate numpy version."""
 
+import functools
+from collections.abc import Callable
+
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +11,13 @@ import pytest
 
 from rtd3jax.agents.agent import count_parameters, make_part
 from rtd3jax.agents.history import Steps, Window
-from rtd3jax.agents.networks import apply_network, carry_before, init_network
+from rtd3jax.agents.networks import (
+    NetworkSpec,
+    apply_network,
+    carry_before,
+    init_network,
+    make_network,
+)
 from rtd3jax.agents.variants import ALGORITHMS
 from rtd3jax.errors import UserError
 from rtd3jax.registries import AGENTS
@@ -136,3 +146,42 @@ def test_initial_weights_are_uniform_in_the_stated_bounds():
     for leaf in params["memory"].values():
         scaled = np.abs(leaf) * 128**0.5
         assert scaled.max() <= 1 and scaled.mean() == pytest.approx(0.5, abs=0.03)
+
+
+class _Encoder(nn.Module):
+    """A layer, and what ``after`` makes of its output."""
+
+    inputs: int
+    outputs: int
+    after: Callable = lambda x: x
+
+    @nn.compact
+    def __call__(self, x):
+        return self.after(nn.Dense(self.outputs)(x))
+
+
+@pytest.mark.parametrize(
+    ("after", "message"),
+    [
+        (lambda x: nn.BatchNorm(use_running_average=True)(x), "batch_stats.*only use parameters"),
+        (lambda x: nn.BatchNorm(use_running_average=False)(x), "batch_stats.*only use parameters"),
+        (lambda x: nn.Dropout(0.5, deterministic=False)(x), "dropout.*or random numbers"),
+        (lambda x: x[:, :3], r"must return float32 \[batch, 8\], not float32\[2, 3\]"),
+        (lambda x: (x, x), r"must return float32 \[batch, 8\], not tuple\[\] for"),
+        (lambda x: x.nothing, "encoder _Encoder failed: .*nothing.*$"),
+    ],
+)
+def test_an_encoder_that_cannot_be_applied_in_training_is_one_line(after, message):
+    def make(after):
+        return make_network(
+            NetworkSpec(current=("observation",)),
+            "lstm",
+            {"observation": O},
+            H,
+            A,
+            encoder=functools.partial(_Encoder, after=after),
+        )
+
+    make(nn.tanh)
+    with pytest.raises(UserError, match=message):
+        make(after)

@@ -1,6 +1,7 @@
 """Tests bit-identical continuation from checkpoints, and messages about bad checkpoints."""
 
 import dataclasses
+import time
 from types import SimpleNamespace
 
 import jax
@@ -185,6 +186,44 @@ def test_another_configuration_is_refused_with_the_difference(stopped, change, m
         _train(stopped, dataclasses.replace(CONFIG, **change))
 
 
+def test_refused_checkpoints_are_named_before_other_lanes_train(stopped, monkeypatch):
+    monkeypatch.setattr(lanes, "compiled", lambda *_: pytest.fail("training began"))
+    other = dataclasses.replace(CONFIG, gamma=0.5)
+    newest = _newest(stopped)[-1]
+    newest.write_bytes(b"")  # the older one of this lane is of another identity, too
+    for strategy in ("map", "vmap"):
+        with pytest.raises(rtd.UserError, match="gamma: 0.99 there, 0.5 here"):
+            rtd.train(
+                _env(), other, range(6), progress=False, checkpoint_dir=stopped, strategy=strategy
+            )
+    assert not (stopped / "seed-5").exists()
+    # Only `restore` says that no file of a lane can be read.
+    for file in newest.parent.iterdir():
+        file.write_bytes(b"")
+    (job,) = run.make_jobs(_env(), other, [int(newest.parent.name.removeprefix("seed-"))], cell=0)
+    run._checkpoints([stopped], [other], _env(), None).check(job)
+
+
+@pytest.mark.parametrize("kept", [False, True])
+def test_an_error_ends_the_training_at_once_unless_checkpoints_keep_the_others(
+    tmp_path, monkeypatch, kept
+):
+    steps = {}
+
+    def chunk(group, *_):
+        if group.jobs[0].seed == 1:
+            raise RuntimeError("out of order")
+        time.sleep(0.005)
+        group.step += 1
+        steps[group.jobs[0].seed] = group.step
+
+    monkeypatch.setattr(lanes, "_chunk", chunk)
+    with pytest.raises(RuntimeError, match="out of order"):
+        _train(tmp_path if kept else None)
+    ended = {seed for seed, step in steps.items() if step == CONFIG.total_steps}
+    assert ended == ({0, 2} if kept else set())
+
+
 def test_another_environment_or_version_is_refused(stopped, monkeypatch):
     with pytest.raises(rtd.UserError, match="another identity .params"):
         _train(stopped, env=rtd.make("rover", disturbance="ar1-slip-fast"))
@@ -287,6 +326,19 @@ def test_a_disk_that_is_full_for_a_moment_does_not_end_the_training(
         _assert_same(result, whole)
     for seed in SEEDS:  # those of the end could be written
         assert checkpoint_steps(tmp_path / f"seed-{seed}")[0] == CONFIG.total_steps
+
+
+@pytest.mark.parametrize("strategy", ["map", "vmap"])
+def test_a_disk_that_stays_full_costs_no_result(strategy, tmp_path, whole, monkeypatch):
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(checkpoint, "write_arrays", fail)
+    with pytest.warns(UserWarning, match="No space left on device; the result is kept in memory"):
+        result = _train(tmp_path, strategy=strategy)
+    assert np.isfinite(result.returns).all()
+    if strategy == "map":
+        _assert_same(result, whole)
 
 
 def test_a_checkpoint_of_one_lane_is_not_one_of_its_group(tmp_path):

@@ -246,6 +246,46 @@ def test_what_is_no_start_is_refused(env, kept, tmp_path):
         rtd.train(pendulum, config, [0], progress=False, start=policy)
 
 
+@pytest.mark.parametrize("of", ["policy", "checkpoints"])
+def test_a_lane_with_checkpoints_does_not_need_its_start_any_more(env, kept, tmp_path, of):
+    run, directory = kept
+    start = tmp_path / "start"
+    if of == "policy":
+        run.policy(0).save(start)
+    else:
+        shutil.copytree(directory, start)
+
+    def train(seeds, start=start, **changes):
+        place = tmp_path / "out"
+        return rtd.train(
+            env, _config(**changes), seeds, progress=False, start=start, checkpoint_dir=place
+        )
+
+    begun = train([0])
+    start.rename(tmp_path / "elsewhere")
+    again = train([0])
+    assert again.config == begun.config and _same(again.policy(0), begun.policy(0))
+    longer = train([0], total_steps=70)
+    np.testing.assert_array_equal(longer.returns[:, :2], begun.returns)
+    # A new lane needs it, and no lane may have begun from something else.
+    with pytest.raises(rtd.UserError, match="start cannot be read"):
+        train([0, 1])
+    with pytest.raises(rtd.UserError, match="nothing cannot be read"):
+        train([0], start=tmp_path / "nothing")
+
+
+def test_the_parts_of_a_policy_are_on_no_fixed_device(env, kept):
+    """So that policies of several accelerators can start lanes of one group."""
+    run, _ = kept
+    policy = jax.device_put(run.policy(0), jax.devices()[0])
+    assert all(leaf.committed for leaf in jax.tree.leaves(policy.actor))
+    start = Start("p", policy)
+    (job,) = make_jobs(env, _config(start="p"), [0], starts={0: start})
+    begun = start.begin(job.program, job.lane, jax.eval_shape(job.program.init, job.lane))
+    taken = begun.learner.actor, begun.learner.target_actor, begun.statistics
+    assert not any(leaf.committed for leaf in jax.tree.leaves(taken))
+
+
 def test_side_by_side_lanes_whose_checkpoints_are_of_no_use_begin_from_the_start_again(
     env, kept, tmp_path
 ):

@@ -1,6 +1,7 @@
 """Tests of the trainer: determinism, independence of lanes, common history lengths."""
 
 import dataclasses
+import threading
 import types
 
 import jax
@@ -266,6 +267,41 @@ def test_a_group_stays_on_its_device_unless_that_is_busy():
     second.step = 100
     assert pool.take("b") is second
     assert pool.take("c") is first and first.device == "c"
+
+
+def test_a_group_that_a_worker_holds_does_not_keep_others_from_being_saved(monkeypatch):
+    """An interrupt that ends the wait for a worker leaves a group whose state is in use."""
+    groups = [lanes.Group([job], state="state") for job in make_jobs(_rover(), TINY, range(2))]
+    held, other = groups
+    taken, saved, found = threading.Event(), threading.Event(), []
+
+    class Impatient(threading.Thread):
+        def join(self, timeout=None):
+            raise KeyboardInterrupt
+
+    def train(pool, device, checkpoints):
+        group = pool.take(device)
+        group.step = 1
+        if group is held:
+            taken.set()
+            saved.wait(20.0)
+        pool.give_back(group)
+
+    def interrupt(group):
+        assert taken.wait(20.0)
+        raise KeyboardInterrupt
+
+    def save_all(ready):
+        found.extend(ready)
+        saved.set()
+
+    impatient = types.SimpleNamespace(**{**vars(threading), "Thread": Impatient})
+    monkeypatch.setattr(lanes, "threading", impatient)
+    monkeypatch.setattr(lanes, "_train", train)
+    with pytest.raises(KeyboardInterrupt):
+        checkpoints = types.SimpleNamespace(save_all=save_all)
+        lanes.advance_groups(groups, interrupt, checkpoints, devices=["a", "b"])
+    assert found == [other]
 
 
 def test_steps_of_a_checkpoint_do_not_count_for_the_speed(monkeypatch):

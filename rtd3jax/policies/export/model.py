@@ -26,11 +26,13 @@ import jax
 import numpy as np
 from jax.typing import ArrayLike
 
+from rtd3jax.agents.memory import GRU, LSTM, Memory, MinGRU
 from rtd3jax.agents.memory.base import Params
 from rtd3jax.agents.networks import Linear, Network
 from rtd3jax.agents.normalise import LIMIT, Normaliser
 from rtd3jax.config import Acting
 from rtd3jax.errors import UserError
+from rtd3jax.registries import MEMORIES
 
 GATES = "ifog"
 """Order of the gates in a folded model: the three sigmoids are adjacent."""
@@ -134,15 +136,8 @@ def fold(
         if set(actor.get(layer, ())) == {"kernel", "bias"}:
             arrays[f"{layer}_kernel"] = actor[layer]["kernel"]
             arrays[f"{layer}_bias"] = actor[layer]["bias"]
-    memory = {name: np.asarray(value) for name, value in actor.get("memory", {}).items()}
-    if cell == "lstm":
-        arrays["input_kernel"] = _reorder(memory["input_kernel"])
-        arrays["input_bias"] = _reorder(memory["input_bias"] + memory["recurrent_bias"])
-        arrays["recurrent_kernel"] = _reorder(memory["recurrent_kernel"])
-    elif cell == "gru":
-        arrays |= memory
-    elif cell == "min-gru":
-        arrays |= {f"input_{name}": array for name, array in memory.items()}
+    if cell is not None and _is_portable(cell):
+        arrays |= _folded(cell, {name: np.asarray(a) for name, a in actor["memory"].items()})
     low, high = np.asarray(low, np.float32), np.asarray(high, np.float32)
     arrays["action_centre"] = np.float32(0.5) * high + np.float32(0.5) * low
     arrays["action_half_range"] = np.float32(0.5) * high - np.float32(0.5) * low
@@ -157,13 +152,31 @@ def fold(
     return {name: np.array(value, np.float32, order="C") for name, value in arrays.items()}
 
 
+def _folded(cell: str, memory: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays of one of the memories `PORTABLE`, from its parameters."""
+    if cell == "lstm":
+        return {
+            "input_kernel": _reorder(memory["input_kernel"]),
+            "input_bias": _reorder(memory["input_bias"] + memory["recurrent_bias"]),
+            "recurrent_kernel": _reorder(memory["recurrent_kernel"]),
+        }
+    if cell == "gru":
+        return memory
+    return {f"input_{name}": array for name, array in memory.items()}
+
+
 def _reorder(array: np.ndarray) -> np.ndarray:
     parts = dict(zip(_TRAINED_GATES, np.split(array, 4, axis=-1), strict=True))
     return np.concatenate([parts[gate] for gate in GATES], axis=-1)
 
 
-PORTABLE = ("lstm", "gru", "min-gru")
+PORTABLE: dict[str, type[Memory]] = {"lstm": LSTM, "gru": GRU, "min-gru": MinGRU}
 """Memories that the formats numpy and ONNX support; StableHLO supports any memory."""
+
+
+def _is_portable(cell: str) -> bool:
+    """Whether the memory ``cell`` is one of `PORTABLE`, and not another module of this name."""
+    return cell in PORTABLE and MEMORIES[cell] is PORTABLE[cell]
 
 
 def carry_shapes(network: Network) -> dict[str, tuple[int, ...]]:
@@ -180,13 +193,15 @@ def carry_shapes(network: Network) -> dict[str, tuple[int, ...]]:
 
 def check_portable(model: Model, form: str) -> None:
     """Raise UserError if the format ``form`` does not support the model's memory or encoder."""
-    if model.cell is not None and model.cell not in PORTABLE:
+    if model.cell is not None and not _is_portable(model.cell):
+        replaced = ", which another module has replaced here" if model.cell in PORTABLE else ""
         raise UserError(
-            f"the format {form} supports the memories {', '.join(PORTABLE)}, not {model.cell!r}; "
-            "export the policy as stablehlo"
+            f"the format {form} supports the memories {', '.join(PORTABLE)} of this package, not "
+            f"{model.cell!r}{replaced}; export the policy as stablehlo"
         )
     layers = (model.network.encoder, model.network.current)
-    if any(layer is not None and not isinstance(layer, Linear) for layer in layers):
+    # A subclass may compute something else from the same parameters.
+    if any(layer is not None and type(layer) is not Linear for layer in layers):
         raise UserError(
             f"the format {form} does not support this agent's encoder; export it as stablehlo"
         )

@@ -1,11 +1,13 @@
 """Tests the contents of exported files, and refused files."""
 
 import ast
+import dataclasses
 import json
 import subprocess
 import sys
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import onnx
 import onnxruntime
@@ -13,7 +15,11 @@ import pytest
 from random_policies import random_policy
 
 import rtd3jax as rtd
+from rtd3jax.agents.memory import GRU
+from rtd3jax.agents.networks import Linear
+from rtd3jax.registries import AGENTS, MEMORIES
 from rtd3jax.system.files import read_arrays, write_arrays
+from rtd3jax.system.program_cache import forget_programs
 
 
 @pytest.fixture(scope="module")
@@ -154,3 +160,68 @@ def test_what_is_no_stablehlo_policy_is_refused(program, tmp_path, policy):
     write_arrays(path, {"program": arrays["program"][:100]}, about)
     with pytest.raises(rtd.UserError, match="cannot be read by this version of JAX"):
         rtd.load_stablehlo(path)
+
+
+@pytest.fixture
+def own_tables(monkeypatch):
+    """What a test registers is gone afterwards."""
+    for registry in (AGENTS, MEMORIES):
+        monkeypatch.setattr(registry, "_entries", dict(registry._entries))
+    yield
+    monkeypatch.undo()
+    forget_programs()
+
+
+class _DoubledGRU(GRU):
+    """A GRU with another output of the same parameters."""
+
+    def read(self, carry):
+        return 2.0 * super().read(carry)
+
+
+class _Average(rtd.Memory):
+    """A memory without parameters."""
+
+    def zero(self, batch):
+        return jnp.zeros((batch, self.width))
+
+    def step(self, carry, token):
+        return 0.5 * (carry + token)
+
+
+class _DoubledLinear(Linear):
+    """A linear layer with another output of the same parameters."""
+
+    def __call__(self, x):
+        return 2.0 * super().__call__(x)
+
+
+@pytest.mark.parametrize(
+    ("memory", "module", "message"),
+    [
+        ("gru", _DoubledGRU, "not 'gru', which another module has replaced here; export"),
+        ("lstm", _Average, "not 'lstm', which another module has replaced here; export"),
+        ("gru", None, "does not support this agent's encoder; export it as stablehlo"),
+    ],
+)
+def test_modules_in_place_of_the_packages_are_only_exported_as_they_are(
+    tmp_path, own_tables, memory, module, message
+):
+    env, algorithm = rtd.make("rover", "ar1-slip"), "lstm-td3-1ha1hc"
+    if module is None:
+        variant = dataclasses.replace(AGENTS[algorithm], encoder=_DoubledLinear)
+        rtd.register_agent("doubled", variant)
+        algorithm = "doubled"
+    else:
+        rtd.register_memory(memory, module, replace=True)
+    policy = random_policy(algorithm, env, memory=memory)
+    for form, name in (("numpy", "p.py"), ("onnx", "p.onnx")):
+        with pytest.raises(rtd.UserError, match=message):
+            policy.export(tmp_path / name, format=form)
+    policy.export(tmp_path / "p.stablehlo", format="stablehlo")
+    program = rtd.load_stablehlo(tmp_path / "p.stablehlo")
+    state, own = program.init(), policy.init()
+    for observation in np.random.default_rng(0).normal(size=(5, 2)).astype(np.float32):
+        expected, own = policy.step(own, observation)
+        action, state = program.step(state, observation[None])
+        np.testing.assert_allclose(action[0], expected, atol=1e-5)
