@@ -38,7 +38,7 @@ def summary_markdown(
         "Over seeds: mean ± standard deviation, and the interquartile mean (IQM) with its 95 % "
         "bootstrap interval. Seeds are finished / planned. Best IQM first. Reference policies "
         "are not trained; their deviation is over episodes. The ceiling is the best possible mean, "
-        "with its standard error.",
+        "or an upper bound of it, with its standard error.",
         "",
     ]
     tasks = {cell[:2] for cell in seeds}

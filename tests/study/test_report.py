@@ -153,6 +153,27 @@ def test_in_a_browser(env, runs):
         page.locator("#scrub").fill("150")
         assert page.locator("#clock").inner_text() == "step 151 of 200"
 
+        # Keys play it, on the button, the slider and the episodes; each control keeps its own keys.
+        clock, play = page.locator("#clock"), page.locator("#play")
+        page.locator("#scrub").fill("10")
+        page.locator("#scrub").press("ArrowRight")
+        assert clock.inner_text() == "step 12 of 200"
+        play.press("ArrowRight")
+        assert clock.inner_text() == "step 13 of 200"
+        page.locator(".stages").press("ArrowLeft")
+        assert clock.inner_text() == "step 12 of 200"
+        page.locator("#scrub").press("Space")
+        assert play.inner_text() == "Pause"
+        play.press("Space")
+        assert play.inner_text() == "Play"
+        page.locator(".stages").press("Space")
+        assert play.inner_text() == "Pause"
+        page.locator("#playback select[name='speed']").press("Space")
+        assert play.inner_text() == "Pause"
+        page.keyboard.press("Escape")  # closes the list of speeds
+        page.locator(".stages").press("Space")
+        assert play.inner_text() == "Play"
+
         # On a phone nothing is wider than the screen; in the dark the paper is dark.
         page.set_viewport_size({"width": 375, "height": 700})
         page.emulate_media(color_scheme="dark")
@@ -163,6 +184,22 @@ def test_in_a_browser(env, runs):
         if pictures := os.environ.get("RTD3JAX_PAGE_PICTURES"):
             page.screenshot(path=f"{pictures}/{env}-phone.png", full_page=True)
         assert troubles == [] and len(requests) == 1
+
+
+def test_a_tap_shows_values_until_the_next(runs):
+    with chromium() as browser:
+        page = browser.new_page(viewport={"width": 375, "height": 700}, has_touch=True)
+        page.goto((runs["rover"] / "report.html").as_uri())
+        tip = page.locator("#tip")
+        for k, length in enumerate((1, 2)):
+            page.locator("#curves svg.plot").nth(k).tap(position={"x": 320, "y": 100})
+            assert f"history {length}: step 60" in tip.inner_text()
+        page.locator("#finals svg rect").first.tap()
+        assert "2 seeds" in tip.inner_text()
+        box = tip.bounding_box()
+        assert box["x"] >= 0 and box["x"] + box["width"] <= 375
+        page.locator("#finals h2").tap()
+        assert tip.is_hidden()
 
 
 def test_an_unfinished_run_has_a_page_that_says_so(runs, tmp_path, monkeypatch):
@@ -240,6 +277,12 @@ def test_returns_of_policies_that_were_trained_further_are_left_out(runs, tmp_pa
     table.to_parquet(run / "transfer.parquet")
     old = page_data(directory, complete=False, playback=False)
     assert old["transfer"] == before["transfer"]
+
+    # A seed with a return that is not a number is counted as lost.
+    table.loc[table.index[0], "return"] = np.nan
+    table.to_parquet(run / "transfer.parquet")
+    first = page_data(directory, complete=False, playback=False)["transfer"][0]
+    assert (first["lost"], first["n"]) == (1, len(directory.seeds) - 1)
 
 
 @pytest.mark.parametrize(

@@ -59,8 +59,10 @@ function farWords(reference, decimals) {
 }
 
 const tip = {
+  anchor: null,
   show(anchor, x, y, ...content) {
     const box = byId('tip');
+    tip.anchor = anchor;
     box.replaceChildren(...content.flat());
     box.hidden = false;
     const frame = anchor.getBoundingClientRect();
@@ -70,17 +72,31 @@ const tip = {
     box.style.left = `${Math.max(8, flipped) + window.scrollX}px`;
     box.style.top = `${frame.top + y + 10 + window.scrollY}px`;
   },
-  hide() { byId('tip').hidden = true; },
+  // A plot only hides its own text: the one that is left loses the focus after the next one was tapped.
+  hide(anchor = tip.anchor) { if (anchor === tip.anchor) byId('tip').hidden = true; },
 };
 
+// A mouse reads a plot by moving. A finger reads it by a tap, whose text stays when the finger is lifted.
+function readByPointer(node, show, hide) {
+  fill(node, {
+    onpointerdown: show,
+    onpointermove: show,
+    onpointercancel: hide,
+    onpointerleave: (event) => { if (event.pointerType !== 'touch') hide(); },
+  });
+}
+
 const swatch = (agent) => el('span', { class: 'swatch', style: `color: var(--a${agent})`, 'aria-hidden': 'true' });
+
+// The width of the numbers on the left of a plot, in pixels.
+const marginFor = (texts) => 14 + 6.4 * highest([0, ...texts.map((text) => text.length)]);
 
 // The frame of a plot: gridlines and numbers, one on the x axis for about `every` pixels. x is environment
 // steps or a strength, y is a return.
 function axes({ width, height, x, y, label, every = 90 }) {
   const marks = ticks(y[0], y[1], 4);
   const texts = marks.values.map((value) => fixed(value, marks.decimals));
-  const left = 14 + 6.4 * Math.max(...texts.map((text) => text.length));
+  const left = marginFor(texts);
   const frame = { left, right: width - 12, top: 8, bottom: height - 24, decimals: decimalsFor(y) };
   frame.x = scale(x[0], x[1], frame.left, frame.right);
   frame.y = scale(y[0], y[1], frame.bottom, frame.top);

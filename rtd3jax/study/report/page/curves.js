@@ -5,7 +5,7 @@ function curvePanels() {
   DATA.environments.forEach((environment, index) => {
     const cells = shownCells().filter((cell) => cell.environment === index);
     if (!cells.length) return;
-    const lengths = [...new Set(cells.map((cell) => cell.length))].filter(Boolean).sort((a, b) => a - b);
+    const lengths = lengthsOf(cells);
     const references = referencesOf(environment, state.measure);
     const curves = cells.map((cell) => cell.curves[state.measure]).filter(Boolean);
     // The same range for all lengths of an environment, so that its panels can be compared. Early returns
@@ -51,13 +51,16 @@ function drawCurves() {
 function legendItems(panels) {
   const agents = [...new Set(panels.flatMap((panel) => panel.cells.map((cell) => cell.agent)))];
   const items = agents.sort((a, b) => a - b).map((agent) => el('span', {}, swatch(agent), DATA.agents[agent].name));
+  return [...items, ...referenceItems(panels)];
+}
+
+function referenceItems(panels) {
   const names = new Map();
   for (const { range } of panels) for (const reference of range.near) names.set(reference.name, dashOf(reference));
-  for (const [name, dash] of names) {
+  return [...names].map(([name, dash]) => {
     const line = draw('line', { x1: 0, x2: 26, y1: 5, y2: 5, class: 'reference', 'stroke-dasharray': dash });
-    items.push(el('span', {}, draw('svg', { width: 26, height: 10, 'aria-hidden': 'true' }, line), name));
-  }
-  return items;
+    return el('span', {}, draw('svg', { width: 26, height: 10, 'aria-hidden': 'true' }, line), name);
+  });
 }
 
 const stepWords = (step) => `step ${step.toLocaleString('en')}`;
@@ -130,12 +133,11 @@ function readable(plot, cells, title, words) {
       });
     tip.show(plot.svg, x, plot.top, el('strong', {}, `${title}: ${words(steps[at])}`), el('table', {}, el('tbody', {}, rows)));
   };
-  const hide = () => { cross.setAttribute('visibility', 'hidden'); tip.hide(); };
+  const hide = () => { cross.setAttribute('visibility', 'hidden'); tip.hide(plot.svg); };
   const nearest = (x) => steps.reduce((best, step, k) => (Math.abs(plot.x(step) - x) < Math.abs(plot.x(steps[best]) - x) ? k : best), 0);
+  readByPointer(plot.svg, (event) => show(nearest(event.clientX - plot.svg.getBoundingClientRect().left)), hide);
   fill(plot.svg, {
     tabindex: 0,
-    onpointermove: (event) => show(nearest(event.clientX - plot.svg.getBoundingClientRect().left)),
-    onpointerleave: hide,
     onfocus: () => { if (plot.svg.matches(':focus-visible')) show(at); },
     onblur: hide,
     onkeydown: (event) => {

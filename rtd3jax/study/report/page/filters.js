@@ -10,7 +10,8 @@ function environmentName(environment) {
 const lengthName = (length) => `history ${length}`;
 const cellName = (cell) =>
   DATA.agents[cell.agent].name + (cell.length ? `, ${lengthName(cell.length)}` : '');
-const allLengths = [...new Set(DATA.cells.map((cell) => cell.length))].filter(Boolean).sort((a, b) => a - b);
+const lengthsOf = (cells) => [...new Set(cells.map((cell) => cell.length))].filter(Boolean).sort((a, b) => a - b);
+const allLengths = lengthsOf(DATA.cells);
 
 // An agent without a window is shown for every length.
 const isShown = (cell) =>
@@ -51,13 +52,22 @@ function measureChoice(update) {
   return el('fieldset', {}, el('legend', {}, 'return'), inputs);
 }
 
+// A large study first shows its first environments: at most this number of panels of learning curves.
+const MOST_PANELS = 12;
+
+function firstEnvironments() {
+  let panels = 0;
+  return DATA.environments.map((_, index) => index).filter((index) => {
+    panels += Math.max(1, lengthsOf(DATA.cells.filter((cell) => cell.environment === index)).length);
+    return index === 0 || panels <= MOST_PANELS;
+  });
+}
+
 function startFilters(update) {
   DATA.agents.forEach((_, index) => state.agents.add(index));
   allLengths.forEach((length) => state.lengths.add(length));
-  // A large study first shows its first environments: about a dozen panels.
-  const panels = Math.max(1, allLengths.length);
-  const first = Math.max(1, Math.floor(12 / panels));
-  DATA.environments.forEach((_, index) => { if (index < first) state.environments.add(index); });
+  firstEnvironments().forEach((index) => state.environments.add(index));
+  const [first, all] = [state.environments.size, DATA.environments.length];
   const form = byId('filters').querySelector('form');
   form.addEventListener('submit', (event) => event.preventDefault());
   form.append(chips('disturbance', state.environments, DATA.environments.map((environment, value) => ({ value, label: environmentName(environment) })), update));
@@ -66,4 +76,5 @@ function startFilters(update) {
     form.append(chips('history length', state.lengths, allLengths.map((value) => ({ value, label: String(value) })), update));
   }
   if (DATA.measures.length > 1) form.append(measureChoice(update));
+  if (first < all) form.append(el('p', { class: 'missing' }, `${first} of ${all} disturbances ${first === 1 ? 'is' : 'are'} selected at first; the charts and the table show the selected ones.`));
 }

@@ -8,7 +8,9 @@ function drawFinals() {
   const body = section.querySelector('.body');
   const panels = DATA.environments
     .map((environment, index) => ({ environment, cells: shownCells().filter((cell) => cell.environment === index && cell.final[state.measure]) }))
-    .filter(({ cells }) => cells.length);
+    .filter(({ cells }) => cells.length)
+    .map((panel) => ({ ...panel, range: finalRange(panel) }));
+  section.querySelector('.legend').replaceChildren(...referenceItems(panels));
   if (!panels.length) {
     body.replaceChildren(el('p', { class: 'missing' }, 'No selected lane has ended yet.'));
     return;
@@ -16,13 +18,14 @@ function drawFinals() {
   panelGrid(body, panels, 430, finalPanel);
 }
 
-function finalPanel({ environment, cells }, width) {
+function finalRange({ environment, cells }) {
+  const finals = cells.map((cell) => cell.final[state.measure]);
+  const values = finals.flatMap((final) => [...final.values, final.low, final.high]);
+  return limits(values, referencesOf(environment, state.measure));
+}
+
+function finalPanel({ environment, cells, range }, width) {
   const rows = [...cells].sort((a, b) => a.agent - b.agent || a.length - b.length);
-  const values = rows.flatMap((cell) => {
-    const final = cell.final[state.measure];
-    return [...final.values, final.low, final.high];
-  });
-  const range = limits(values, referencesOf(environment, state.measure));
   const names = rows.map(cellName);
   const left = Math.min(width * 0.45, 18 + 6.3 * Math.max(...names.map((name) => name.length)));
   const line = 24;
@@ -58,14 +61,14 @@ function finalRow(cell, name, y, x, left, right) {
   if (finite(final.iqm)) group.append(draw('circle', { cx: x(final.iqm), cy: y, r: 4.6, fill: 'currentColor' }));
   const hit = draw('rect', { x: left, y: y - 11, width: right - left, height: 22, fill: 'transparent' });
   const decimals = decimalsFor([final.iqm]);
-  hit.addEventListener('pointermove', (event) => {
+  const show = (event) => {
     const frame = hit.ownerSVGElement.getBoundingClientRect();
     const spread = finite(final.low) ? ` [${fixed(final.low, decimals)}, ${fixed(final.high, decimals)}]` : '';
     const lost = final.lost ? `, ${final.lost} lost` : '';
     tip.show(hit.ownerSVGElement, event.clientX - frame.left, y, el('strong', {}, name),
       `${fixed(final.iqm, decimals)}${spread}, ${plural(final.n, 'seed')}${lost}`);
-  });
-  hit.addEventListener('pointerleave', () => tip.hide());
+  };
+  readByPointer(hit, show, () => tip.hide());
   group.append(hit);
   return group;
 }

@@ -5,7 +5,7 @@ function learningPanels() {
   for (const metric of DATA.metrics) {
     DATA.environments.forEach((environment, index) => {
       const cells = shownCells().filter((cell) => cell.environment === index && cell.learning[metric]);
-      const lengths = [...new Set(cells.map((cell) => cell.length))].filter(Boolean).sort((a, b) => a - b);
+      const lengths = lengthsOf(cells);
       for (const length of lengths.length ? lengths : [0]) {
         const here = cells.filter((cell) => cell.length === 0 || cell.length === length)
           .map((cell) => ({ ...cell, curves: { [state.measure]: cell.learning[metric] } }));

@@ -69,6 +69,9 @@ startLearning();
 redraw();
 startPlayback();
 drawStudy();
+// The text of a tap stays until the next tap, which is seen here before the plot that shows another.
+addEventListener('pointerdown', () => tip.hide(), true);
+addEventListener('keydown', (event) => { if (event.key === 'Escape') tip.hide(); });
 let settled = null;
 let width = document.documentElement.clientWidth;
 addEventListener('resize', () => {

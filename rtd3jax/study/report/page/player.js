@@ -31,7 +31,7 @@ function startPlayback() {
     return;
   }
   about.textContent = 'Two trained policies, each of the seed with the median return. All agents of an ' +
-    'environment meet the same episodes. Space starts and stops the playback; the arrow keys go to the next or previous frame.';
+    'environment meet the same episodes. While the player has the focus, Space starts and stops the playback, and the arrow keys go to the next or previous frame.';
   const environments = [...new Set(DATA.playback.map((entry) => DATA.cells[entry.cell].environment))];
   player.environment = environments[0];
   const environmentSelect = selectOf('disturbance', environments.map((environment) => [environment, environmentName(DATA.environments[environment])]), (value) => {
@@ -51,16 +51,18 @@ function startPlayback() {
   const scrub = el('input', { type: 'range', id: 'scrub', min: 0, value: 0, 'aria-label': 'frame' });
   scrub.addEventListener('input', () => { player.playing = false; goTo(Number(scrub.value)); });
   const clock = el('span', { class: 'clock', id: 'clock' });
-  const stages = el('div', { class: 'stages' });
+  const stages = el('div', { class: 'stages', tabindex: 0, role: 'group', 'aria-label': 'Episodes' });
   body.replaceChildren(
     el('div', { class: 'controls' }, environmentSelect.node, cellSelects.map((s) => s.node), runSelect.node),
     el('div', { class: 'controls' }, play, el('label', { class: 'scrub' }, scrub), clock, speedSelect.node),
     stages);
   section.addEventListener('keydown', (event) => {
-    if (['SELECT', 'INPUT', 'BUTTON'].includes(event.target.tagName)) return;
-    if (event.key === ' ') { event.preventDefault(); toggle(); }
+    // A key keeps what it does in a control, and with a modifier: Alt and an arrow leave the page.
+    const isOn = (...tags) => tags.includes(event.target.tagName);
+    if (event.altKey || event.ctrlKey || event.metaKey) return;
+    if (event.key === ' ' && !isOn('BUTTON', 'SELECT')) { event.preventDefault(); toggle(); }
     const move = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
-    if (move) { event.preventDefault(); player.playing = false; goTo(player.frame + move); }
+    if (move && !isOn('INPUT', 'SELECT')) { event.preventDefault(); player.playing = false; goTo(player.frame + move); }
   });
 
   const here = () => DATA.playback.filter((entry) => DATA.cells[entry.cell].environment === player.environment);
@@ -141,7 +143,10 @@ function makeStage(entry, index) {
     const width = node.clientWidth;
     const picture = (SCENES[entry.kind] || noScene)(entry, run, width);
     scene.replaceChildren(...(picture.svg ? [picture.svg] : []));
-    const rows = tracesOf(entry, run).map((trace) => makeTrace(trace, run, width));
+    const signals = tracesOf(entry, run).map((trace) => ({ ...trace, axis: traceAxis(trace) }));
+    // The same margin for all signals, so that their cursors are in one line.
+    const left = marginFor(signals.flatMap(({ axis }) => axis.texts));
+    const rows = signals.map((signal) => makeTrace(signal, run, left, width));
     traces.replaceChildren(...rows.map((row) => row.node));
     stage.show = (t) => {
       picture.show(t);
@@ -266,20 +271,24 @@ function tracesOf(entry, run) {
   return found;
 }
 
-function makeTrace({ name, lines }, run, width) {
-  const height = 62;
+// The limits and the numbers of a signal's axis.
+function traceAxis({ lines }) {
   const values = lines.flatMap((line) => line.values);
-  const [low, high] = [Math.min(...values), Math.max(...values)];
+  const [low, high] = [lowest(values), highest(values)];
   const margin = 0.08 * (high - low || 1);
   const marks = ticks(low - margin, high + margin, 2);
-  const left = 44;
+  return { low: low - margin, high: high + margin, values: marks.values, texts: marks.values.map((value) => fixed(value, marks.decimals)) };
+}
+
+function makeTrace({ name, lines, axis }, run, left, width) {
+  const height = 62;
   const x = scale(0, Math.max(1, run.steps - 1), left, width - 6);
-  const y = scale(low - margin, high + margin, height - 4, 4);
+  const y = scale(axis.low, axis.high, height - 4, 4);
   const svg = draw('svg', { class: 'plot', width, height, viewBox: `0 0 ${width} ${height}`, 'aria-hidden': 'true' });
-  for (const value of marks.values) {
+  axis.values.forEach((value, k) => {
     svg.append(draw('line', { class: 'grid', x1: left, x2: width - 6, y1: y(value), y2: y(value) }));
-    svg.append(draw('text', { x: left - 5, y: y(value) + 4, 'text-anchor': 'end' }, fixed(value, marks.decimals)));
-  }
+    svg.append(draw('text', { x: left - 5, y: y(value) + 4, 'text-anchor': 'end' }, axis.texts[k]));
+  });
   for (const line of lines) {
     const points = line.values.map((value, t) => `${x(t).toFixed(1)},${y(value).toFixed(1)}`).join(' ');
     svg.append(draw('polyline', { class: `line ${line.kind}`, points, 'stroke-width': 1.4 }));

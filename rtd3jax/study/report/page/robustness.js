@@ -6,7 +6,7 @@ function robustnessPanels() {
     const here = DATA.robustness
       .map((entry) => ({ entry, cell: DATA.cells[entry.cell] }))
       .filter(({ entry, cell }) => cell.environment === index && isShown(cell) && entry.curves[state.measure]);
-    const lengths = [...new Set(here.map(({ cell }) => cell.length))].filter(Boolean).sort((a, b) => a - b);
+    const lengths = lengthsOf(here.map(({ cell }) => cell));
     for (const stress of [...new Set(here.map(({ entry }) => entry.stress))]) {
       const entries = here.filter(({ entry }) => entry.stress === stress);
       const { quantity } = entries[0].entry;

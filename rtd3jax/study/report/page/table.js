@@ -10,9 +10,15 @@ function normalised(value, environment) {
   return random && best && finite(value) ? (value - random.value) / (best.value - random.value) : null;
 }
 
-function tableColumns(decimals) {
+// Each row has the decimals of its own return: with those of -1000, a return of -1.3 would lose its digits.
+function decimalsOfRow(row) {
+  const final = row.final || {};
+  return decimalsFor([final.iqm ?? final.mean]);
+}
+
+function tableColumns() {
   const final = (row) => row.final || {};
-  const numeric = (name, value, places = decimals) => ({ name, number: true, value, text: (row) => fixed(value(row), places) });
+  const numeric = (name, value, places) => ({ name, number: true, value, text: (row) => fixed(value(row), places ?? decimalsOfRow(row)) });
   return [
     { name: 'disturbance', value: (row) => environmentName(row.environment), text: (row) => environmentName(row.environment) },
     { name: 'policy', value: (row) => row.name, text: (row) => (row.cell ? el('span', { class: 'agent' }, swatch(row.cell.agent), row.name) : row.name) },
@@ -20,7 +26,7 @@ function tableColumns(decimals) {
     { name: 'seeds', number: true, value: (row) => final(row).n, text: (row) => (row.cell ? `${final(row).n || 0} of ${row.cell.seeds}` : DASH) },
     numeric('IQM', (row) => final(row).iqm),
     { name: '95 % interval', value: (row) => final(row).low, number: true,
-      text: (row) => (finite(final(row).low) ? `${fixed(final(row).low, decimals)} to ${fixed(final(row).high, decimals)}` : DASH) },
+      text: (row) => (finite(final(row).low) ? `${fixed(final(row).low, decimalsOfRow(row))} to ${fixed(final(row).high, decimalsOfRow(row))}` : DASH) },
     numeric('mean', (row) => final(row).mean),
     numeric('std', (row) => final(row).std),
     numeric('normalised', (row) => normalised(final(row).mean, row.environment), 3),
@@ -53,9 +59,9 @@ function tableRows() {
 function drawTable() {
   const section = byId('table');
   section.querySelector('.about').textContent =
-    'Final returns; click a heading to sort. Normalised: 0 is the uniform random policy, 1 is the ceiling, the best possible return.';
+    'Final returns; click a heading to sort. Normalised: 0 is the uniform random policy, 1 is the ceiling: the best possible return, or an upper bound of it.';
   const rows = tableRows();
-  const columns = tableColumns(decimalsFor(rows.map((row) => row.final && row.final.mean)));
+  const columns = tableColumns();
   if (sorting.column !== null) {
     const { value } = columns[sorting.column];
     const sign = sorting.descending ? -1 : 1;
