@@ -41,7 +41,7 @@ def quick_studies():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ceilings, "ceiling", functools.partial(ceilings.ceiling, episodes=100))
         patch.setattr(references, "EPISODES", 2)
-        patch.setattr(derive, "__kwdefaults__", {"pictures": False})
+        patch.setattr(derive, "__kwdefaults__", {**derive.__kwdefaults__, "pictures": False})
         yield
 
 
@@ -50,4 +50,4 @@ def pictures(monkeypatch):
     """Studies draw their pictures after all."""
     from rtd3jax.study.derive import derive
 
-    monkeypatch.setattr(derive, "__kwdefaults__", {"pictures": True})
+    monkeypatch.setattr(derive, "__kwdefaults__", {**derive.__kwdefaults__, "pictures": True})

@@ -242,8 +242,8 @@ def test_intervals_of_checkpoints(text, interval):
 def test_tables_during_a_study_hold_the_lanes_that_have_ended(tmp_path, monkeypatch):
     rows, real = [], interim.derive
 
-    def derive(directory, *rest):
-        real(directory, *rest)
+    def derive(directory, *rest, **fields):
+        real(directory, *rest, **fields)
         rows.append(len(read_table(directory.path / "curves.parquet", CURVES)))
 
     monkeypatch.setattr(interim, "SECONDS", -1.0)
@@ -390,7 +390,7 @@ def test_a_final_evaluation_that_fails_does_not_stop_other_lanes(tmp_path, monke
 def test_tables_that_fail_during_a_study_do_not_stop_it(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(interim, "SECONDS", -1.0)
 
-    def derive(*_):
+    def derive(*_, **__):
         raise UserError("a lane is damaged")
 
     monkeypatch.setattr(interim, "derive", derive)

@@ -37,12 +37,18 @@ from rtd3jax.study.plan import Cell
 from rtd3jax.study.rundir import PACKAGES, RunDirectory
 from rtd3jax.system.files import user_path
 from rtd3jax.system.imports import import_modules
+from rtd3jax.system.interrupts import patient
 from rtd3jax.system.versions import versions_of
 from rtd3jax.training.checkpoint import checkpoint_steps
 from rtd3jax.training.lanes import Job, workers
 
 _POLL_SECONDS = 0.1
 _CONNECT_SECONDS = 10.0
+_ENDING_SECONDS = 60.0
+_ENDING = (
+    "the tasks end their current steps and write checkpoints; another interrupt ends them without "
+    "these"
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -306,9 +312,10 @@ def _watch(
                 if done:
                     interim.refresh()
     except KeyboardInterrupt:
-        for task in pending:
-            ray.cancel(task, force=False)
-        ray.wait(list(pending), num_returns=len(pending), timeout=60)
+        with patient(_ENDING):
+            for task in pending:
+                ray.cancel(task, force=False)
+            ray.wait(list(pending), num_returns=len(pending), timeout=_ENDING_SECONDS)
         raise
 
 

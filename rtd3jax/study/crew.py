@@ -14,8 +14,13 @@ from typing import Any
 
 from rtd3jax.errors import UserError
 from rtd3jax.study import worker
+from rtd3jax.system.interrupts import patient
 from rtd3jax.training.lanes import Group
 
+_ENDING = (
+    "the processes end their current steps and write checkpoints; another interrupt ends them "
+    "without these"
+)
 _PATIENCE_SECONDS = 300.0
 """Seconds that processes have to end a chunk or a compilation, and to write checkpoints."""
 
@@ -153,13 +158,14 @@ class Crew:
                 yield self._messages.get_nowait()
 
     def _end(self) -> None:
-        """Let the processes write checkpoints; at a second Ctrl-C, or much later, kill them."""
+        """Let the processes write checkpoints; if a user insists, or much later, kill them."""
         try:
-            until = time.monotonic() + _PATIENCE_SECONDS
-            for member in self.members:
-                member.end()
-            for member in self.members:
-                member.wait(until - time.monotonic())
+            with patient(_ENDING):
+                until = time.monotonic() + _PATIENCE_SECONDS
+                for member in self.members:
+                    member.end()
+                for member in self.members:
+                    member.wait(until - time.monotonic())
         finally:
             for member in self.members:
                 member.kill()

@@ -31,20 +31,26 @@ class Reference:
 
 
 def derive(
-    directory: RunDirectory, references: Iterable[Reference], *, pictures: bool = True
+    directory: RunDirectory,
+    references: Iterable[Reference],
+    *,
+    wait: bool = True,
+    pictures: bool = True,
 ) -> None:
     """Write tables, figures and the summary of the lanes that have ended.
 
     Args:
         directory: the run directory.
         references: policies that need no training.
+        wait: whether to wait while another process writes them.
         pictures: whether to draw the figures.
 
     Raises:
         UserError: when the file of a lane is damaged.
+        BlockingIOError: when another process writes them now, and ``wait`` is false.
     """
     # If shards end together, the last one that holds the lock reads the lanes of all.
-    with deriver(directory.path):
+    with deriver(directory.path, wait):
         _derive(directory, references, pictures)
 
 

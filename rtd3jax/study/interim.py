@@ -26,14 +26,17 @@ class InterimResults:
     def refresh(self) -> None:
         """Update the results, unless this was done less than `SECONDS` ago.
 
-        An error, such as a damaged file of another lane, is printed once, and the training goes on.
+        Nothing is done while another shard updates them, because the training would wait for it. An
+        error, such as a damaged file of another lane, is printed once, and the training goes on.
         """
         if time.perf_counter() - self._made <= SECONDS:
             return
         try:
-            derive(self._directory, self._references)
+            derive(self._directory, self._references, wait=False)
             if self._page:
                 refresh_page(self._directory, complete=False)
+        except BlockingIOError:
+            pass  # another shard writes them now
         except Exception as error:
             if (reason := short_reason(error)) not in self._said:
                 print(f"no tables during the training: {reason}", file=sys.stderr)

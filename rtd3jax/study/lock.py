@@ -41,6 +41,8 @@ def writer(directory: Path, shard: tuple[int, int] | None) -> Iterator[list[int]
             name = f".lock-{shard[0]}-of-{shard[1]}"
             taken = f"another process is writing shard {shard[0]}/{shard[1]} of it"
             handles.append(_hold(stack, directory, directory / name, False, taken))
+            # Of two divisions that start together, each may not have had its lock before.
+            _refuse_other_divisions(directory, shard[1])
         yield handles
 
 
@@ -51,7 +53,8 @@ def _refuse_other_divisions(directory: Path, count: int) -> None:
     """
     for path in directory.glob(".lock-*-of-*"):
         other = path.name.rpartition("-")[2]
-        if other.isdigit() and int(other) != count and _is_locked(path):
+        # Shared, so that shards which look at the same moment do not take each other for a holder.
+        if other.isdigit() and int(other) != count and _is_locked(path, shared=True):
             raise UserError(
                 f"--out {directory}: another process divides the study into {other} shards; wait "
                 f"for it, or use --shard i/{other}"
@@ -59,21 +62,26 @@ def _refuse_other_divisions(directory: Path, count: int) -> None:
 
 
 @contextlib.contextmanager
-def deriver(directory: Path) -> Iterator[None]:
-    """Wait for the lock of the tables, which all shards share, and hold it."""
+def deriver(directory: Path, wait: bool = True) -> Iterator[None]:
+    """Hold the lock of the tables, which all shards share.
+
+    Raises:
+        BlockingIOError: when another process holds the lock, and ``wait`` is false.
+    """
     with contextlib.ExitStack() as stack:
         handle = _open(directory, directory / ".lock-tables")
         stack.callback(os.close, handle)
-        lock(handle, wait=True)
+        lock(handle, wait=wait)
         yield
 
 
 def is_held(directory: Path) -> bool:
     """Whether a process is writing to the directory now."""
-    return _is_locked(directory / ".lock")
+    return _is_locked(directory / ".lock", shared=False)  # shards hold it shared
 
 
-def _is_locked(path: Path) -> bool:
+def _is_locked(path: Path, *, shared: bool) -> bool:
+    """Whether a process holds the lock; with ``shared``, whether it holds it exclusively."""
     try:
         handle = open_for_locking(path, create=False)
     except OSError:
@@ -81,7 +89,7 @@ def _is_locked(path: Path) -> bool:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the warning of a file system without locks
-            lock(handle)
+            lock(handle, shared=shared)
     except BlockingIOError:
         return True
     except OSError as error:

@@ -158,12 +158,18 @@ class Cost:
 
 
 def estimate(
-    jobs: Sequence[Job], strategy: str, say: Callable[[str], None] = lambda line: None
+    jobs: Sequence[Job],
+    strategy: str,
+    at_once: int,
+    say: Callable[[str], None] = lambda line: None,
 ) -> Cost:
-    """Count programs and bytes, and time some programs; ``say`` receives lines of progress."""
+    """Count programs and bytes, and time some programs; ``say`` receives lines of progress.
+
+    ``at_once`` is the number of lanes that fit in memory, as in `study_seconds`.
+    """
     sizes = job_bytes(jobs)
     state, work = (max(column) for column in zip(*sizes.values(), strict=True))
-    return Cost(len(sizes), state, work, study_seconds(jobs, strategy, update_flops, say))
+    return Cost(len(sizes), state, work, study_seconds(jobs, strategy, update_flops, say, at_once))
 
 
 def update_flops(config: Config) -> float:
@@ -241,7 +247,7 @@ def plan_text(
     """The plan of a sweep as text, with memory and time; ``memory`` is in bytes."""
     count = len(workers())
     fit = lanes_at_once(jobs, strategy, count, memory)  # before a lane is allocated and timed
-    cost = estimate(jobs, strategy, say)
+    cost = estimate(jobs, strategy, fit, say)
     in_total = lanes_in_total(fit, strategy, count)
     waits = f"; the other {len(jobs) - in_total:,} wait" if in_total < len(jobs) else ""
     whole = len(cells) * len(seeds)

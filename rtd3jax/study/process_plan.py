@@ -16,7 +16,8 @@ class Shares:
 
     Attributes:
         cores: the cores of each process, to which it is pinned; empty where the system cannot pin.
-        lanes: largest number of lanes that a process trains at a time: one for each of its cores.
+        lanes: largest number of lanes that a process trains at a time: one for each of its cores,
+            but at most its share of the lanes.
     """
 
     cores: tuple[tuple[int, ...], ...]
@@ -58,14 +59,29 @@ def shares_of(processes: int, jobs: Sequence[Job], strategy: str) -> Shares:
         raise UserError(
             f"--processes {processes}: this process may use {cores()} cores; give at most as many"
         )
-    shares = _divided(min(processes, len(jobs)))
-    needed, limit = processes_bytes(jobs, shares.processes, shares.lanes), memory_limit()
+    count = min(processes, len(jobs))
+    if count == 1:
+        return Shares(((),))
+    needed, limit = _bytes(jobs, count), memory_limit()
     if needed > limit:
+        # Fewer processes train as many lanes at a time; one process lets lanes wait for memory.
+        fewer = next((n for n in range(count - 1, 1, -1) if _bytes(jobs, n) <= limit), 1)
         raise UserError(
             f"--processes {processes} needs {needed / 2**30:,.1f} GiB, but there are only "
-            f"{limit / 2**30:,.1f}; use fewer processes, or --processes 1"
+            f"{limit / 2**30:,.1f}; use --processes {fewer}, or lower replay_capacity, "
+            "hidden_size, batch_size or history_length"
         )
-    return shares
+    return _shared(count, jobs)
+
+
+def _bytes(jobs: Sequence[Job], processes: int) -> int:
+    return processes_bytes(jobs, processes, _shared(processes, jobs).lanes)
+
+
+def _shared(processes: int, jobs: Sequence[Job]) -> Shares:
+    """The division of all cores among the processes, without room for more lanes than there are."""
+    shares = _divided(processes)
+    return dataclasses.replace(shares, lanes=min(shares.lanes, -(-len(jobs) // processes)))
 
 
 def _divided(processes: int) -> Shares:

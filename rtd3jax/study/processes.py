@@ -142,7 +142,9 @@ class _Study:
             lanes = new[0] if new else max(waiting.values(), key=len)
         # A lane whose process was killed may be the cause: it is trained alone.
         alone = self._killed[id(lanes[0])] > 0
-        chosen = lanes[: 1 if alone else len(member.cores) or self._at_once]
+        # With more cores than its share of the lanes, it would leave none for the others.
+        most = min(len(member.cores) or self._at_once, self._at_once)
+        chosen = lanes[: 1 if alone else most]
         self._waiting = [group for group in self._waiting if group not in chosen]
         return chosen
 
@@ -160,6 +162,8 @@ class _Study:
                 self._complaints += message["ended"]
             elif "lane" in message:
                 group = self._lanes[tuple(message["lane"])]
+                if group.returns is None:  # a later process begins at steps that were trained here
+                    group.began_at = message["began_at"]
                 group.step, group.returns = message["step"], np.array([message["returns"]])
                 self._show(group)
             else:

@@ -91,7 +91,8 @@ def current_tables(
     """The tables `SCHEMAS` of all lanes that have ended; without any lane they are empty.
 
     The rows are those of the Parquet files, and those of the lanes that ended after the files were
-    written, because a sweep that is killed does not write its tables. Nothing is written.
+    written, because a sweep that is killed does not write its tables. Rows of a lane that is to be
+    trained to more steps are left out, as `rows_of_lanes` does. Nothing is written.
 
     Args:
         directory: the run directory.
@@ -107,7 +108,7 @@ def current_tables(
         with _noted(notes):
             if path.exists():
                 tables[name] = read_table(path, schema)
-    rows, replaced = Rows(), _later_lanes(directory, tables)
+    rows, replaced = Rows(), _replaced_lanes(directory, tables)
     for cell, seed in replaced:
         with _noted(notes):
             rows.add(directory.lanes, cell, seed)
@@ -122,29 +123,38 @@ def current_tables(
     return found
 
 
-def _later_lanes(
+def _replaced_lanes(
     directory: RunDirectory, tables: dict[str, pd.DataFrame]
 ) -> list[tuple[Cell, int]]:
-    """The lanes whose files are not in the tables, or are newer than the tables.
+    """The lanes with files that are not in the tables, are newer than these, or have too few steps.
 
-    A file is newer if the lane was trained further, or again.
+    A file is newer if the lane was trained further, or again. It has too few steps if the study was
+    extended and the lane has not been trained further yet.
     """
-    table = directory.path / "curves.parquet"
-    written = table.stat().st_mtime_ns if table.exists() else 0
-    there = {
-        lane
-        for name in ("curves", "episodes")
-        for lane in tables[name][[*CELL, "seed"]].drop_duplicates().itertuples(False, None)
-    }
+    written = min(_written(directory, name) for name in SCHEMAS)
+    # A sweep that is killed between two tables leaves some of them without its latest lanes.
+    there = set.intersection(*map(_lanes_of, tables.values()))
     found = []
     for cell in directory.cells:
         for seed in directory.seeds:
             path = directory.lanes.lane_path(cell, seed)
             if path.exists() and (
-                (*cell.key.values(), seed) not in there or path.stat().st_mtime_ns >= written
+                (*cell.key.values(), seed) not in there
+                or path.stat().st_mtime_ns >= written
+                or not directory.lanes.is_done(cell, seed)
             ):
                 found.append((cell, seed))
     return found
+
+
+def _written(directory: RunDirectory, name: str) -> int:
+    """When a table was written, in nanoseconds; 0 without the table."""
+    path = directory.path / f"{name}.parquet"
+    return path.stat().st_mtime_ns if path.exists() else 0
+
+
+def _lanes_of(table: pd.DataFrame) -> set[tuple[Any, ...]]:
+    return set(table[[*CELL, "seed"]].drop_duplicates().itertuples(False, None))
 
 
 @contextlib.contextmanager

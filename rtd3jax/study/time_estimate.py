@@ -1,8 +1,8 @@
 """Estimates the time of a study by running some of its programs for a second each.
 
 A count of operations does not take into account this machine and its load. So some programs of the
-study are compiled and timed on all workers together; the times of other programs are interpolated
-by their operations.
+study are compiled and timed on all workers that the study will keep busy; the times of other
+programs are interpolated by their operations.
 """
 
 import threading
@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rtd3jax.config import Config
+from rtd3jax.study.memory_plan import lanes_in_total
 from rtd3jax.system.interrupts import patient
 from rtd3jax.system.jax_settings import jax_settings, with_settings
 from rtd3jax.training.executables import compiled
@@ -29,18 +30,22 @@ def study_seconds(
     strategy: str,
     operations: Callable[[Config], float],
     say: Callable[[str], None] = lambda line: None,
+    at_once: int | None = None,
 ) -> float:
     """Seconds that the jobs need with all workers, without compilation.
 
     Args:
         jobs: the jobs, one for each lane.
-        strategy: with ``map``, a worker trains one lane after the other; with ``vmap``, it trains
-            its share of a program's lanes together, but lanes with simulators one after the other.
+        strategy: with ``map``, a lane is trained by one worker at a time; with ``vmap``, a worker
+            trains its share of a program's lanes together, but lanes with simulators one by one.
         operations: returns the operations of a configuration per environment step, by which times
             are interpolated.
         say: receives a line before each measurement.
+        at_once: number of lanes that fit in memory, under ``vmap`` for each device; all by default.
     """
-    devices = len(workers())
+    devices, most = len(workers()), at_once or len(jobs)
+    # Lanes beyond these are not allocated, and workers beyond these have no lane.
+    busy = min(devices, len(jobs), lanes_in_total(most, strategy, devices))
     lanes: dict[Executable, list[Job]] = {}
     for job in jobs:
         lanes.setdefault(job.executable, []).append(job)
@@ -52,27 +57,40 @@ def study_seconds(
         own = lanes[executables[place]]
         config = own[0].program.config
         say(f"timing {number} of {len(places)}: {config.words}")
-        width = 1 if advances_alone(own[0], strategy) else -(-len(own) // devices)
-        timed[executables[place]] = group_seconds(own[:width])
+        width = 1 if advances_alone(own[0], strategy) else _width(own, devices, most)
+        # As many lanes as the study will train at once: repeated ones stand for other programs.
+        timed[executables[place]] = group_seconds([own[k % len(own)] for k in range(busy * width)])
     whole = _filled_in(executables, timed, operations)
-    # A worker's lanes of a program: one after the other, or together.
-    return sum(
-        seconds * (len(own) / devices if advances_alone(own[0], strategy) else 1)
-        for own, seconds in ((lanes[executable], whole[executable]) for executable in executables)
-    )
+    alone, together = [0.0], 0.0
+    for executable in executables:
+        own, seconds = lanes[executable], whole[executable]
+        if advances_alone(own[0], strategy):
+            alone += [seconds] * len(own)
+        else:
+            together += seconds * -(-len(own) // (devices * _width(own, devices, most)))
+    # Workers share these lanes, but a lane never has more than one worker.
+    return together + max(sum(alone) / busy, max(alone))
+
+
+def _width(own: Sequence[Job], devices: int, most: int) -> int:
+    """Number of a program's lanes that a device advances together."""
+    return min(-(-len(own) // devices), most)
 
 
 def group_seconds(jobs: Sequence[Job]) -> float:
-    """Seconds of a worker for these lanes, while the other workers do the same."""
+    """Seconds of the workers for these lanes of one program, which they share and train at once.
+
+    With fewer lanes than workers, the other workers are idle.
+    """
     program = jobs[0].program
-    steps, evaluations = zip(*_on_all_workers(jobs), strict=True)
+    steps, evaluations = zip(*_measured(jobs), strict=True)
     learning = max(0, program.config.total_steps - program.config.learning_starts)
     return float(np.mean(steps)) * learning + float(np.mean(evaluations)) * program.evaluations
 
 
-def _on_all_workers(jobs: Sequence[Job]) -> list[tuple[float, float]]:
-    """For each worker, the seconds of a step with updates, and of an evaluation."""
-    devices = workers()
+def _measured(jobs: Sequence[Job]) -> list[tuple[float, float]]:
+    """For each worker with a lane, the seconds of a step with updates, and of an evaluation."""
+    devices = workers()[: len(jobs)]
     together, settings = threading.Barrier(len(devices)), jax_settings()
     found: dict[int, tuple[float, float]] = {}
     errors: list[BaseException] = []
@@ -80,7 +98,7 @@ def _on_all_workers(jobs: Sequence[Job]) -> list[tuple[float, float]]:
     def work(number: int, device: jax.Device) -> None:
         try:
             with with_settings(settings), jax.debug_nans(False):
-                found[number] = _timed(jobs, device, together)
+                found[number] = _timed(jobs[number :: len(devices)], device, together)
         except BaseException as error:
             errors.append(error)
             together.abort()

@@ -81,7 +81,8 @@ def _serve(settings: dict[str, Any], orders_from: IO[str], answer: Answer) -> No
         (trained,) = group.jobs
         if group.returns is not None:
             lane = [places[trained.cell], trained.seed]
-            answer({"lane": lane, "step": group.step, "returns": group.returns[0].tolist()})
+            told = {"lane": lane, "step": group.step, "began_at": group.began_at}
+            answer({**told, "returns": group.returns[0].tolist()})
         if orders.stopped.is_set():
             raise KeyboardInterrupt
 

@@ -6,7 +6,8 @@ import warnings
 
 import pytest
 
-from rtd3jax.study import filelock
+from rtd3jax.errors import UserError
+from rtd3jax.study import filelock, lock
 from rtd3jax.study.lock import deriver, is_held, writer
 
 
@@ -77,6 +78,54 @@ def test_a_file_system_without_locks_is_a_warning(code, tmp_path, monkeypatch):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert not is_held(tmp_path)
+
+
+@pytest.mark.parametrize("system", ["here", "windows"])
+def test_shards_that_look_for_other_divisions_at_the_same_time_do_not_refuse_each_other(
+    system, tmp_path, request, monkeypatch
+):
+    """Files of an earlier division stay, and each new shard looks whether they are locked."""
+    if system == "windows":
+        request.getfixturevalue("windows")
+    (tmp_path / ".lock-1-of-3").touch()
+    real, looked = lock.lock, []
+
+    def look(handle, **options):
+        real(handle, **options)
+        if os.path.samestat(os.fstat(handle), os.stat(tmp_path / ".lock-1-of-3")) and not looked:
+            looked.append(handle)
+            with writer(tmp_path, (1, 2)):  # the other shard, while this one looks
+                pass
+
+    monkeypatch.setattr(lock, "lock", look)
+    with writer(tmp_path, (2, 2)):
+        assert looked
+
+
+def test_a_running_division_is_refused(tmp_path):
+    with (
+        writer(tmp_path, (1, 3)),
+        pytest.raises(UserError, match="divides the study into 3 shards.*--shard i/3"),
+        writer(tmp_path, (1, 2)),
+    ):
+        pass
+
+
+def test_of_two_divisions_that_start_together_one_is_refused(tmp_path, monkeypatch):
+    real, begun = lock._hold, []
+
+    def hold(stack, directory, path, *rest):
+        if path.name == ".lock-1-of-2":  # nothing was found; at this moment the other one begins
+            begun.append(stack.enter_context(writer(tmp_path, (1, 3))))
+        return real(stack, directory, path, *rest)
+
+    monkeypatch.setattr(lock, "_hold", hold)
+    with (
+        pytest.raises(UserError, match="divides the study into 3 shards"),
+        writer(tmp_path, (1, 2)),
+    ):
+        pass
+    assert begun
 
 
 def test_other_errors_are_not_hidden(handles, monkeypatch):

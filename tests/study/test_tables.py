@@ -1,12 +1,14 @@
 """Tests that tables hold all lanes that have ended, also after a sweep was killed."""
 
+import dataclasses
 import os
 import shutil
 import sys
 
+import numpy as np
 import pandas as pd
 import pytest
-from made_run import make_run
+from made_run import STEPS, make_run
 
 import rtd3jax as rtd
 from rtd3jax import stress
@@ -70,6 +72,53 @@ def test_lanes_that_ended_after_the_tables_were_written_are_there(count, whole, 
     ]
     compared = compare_runs([whole, killed], ["whole", "killed"])
     assert compared["n"].tolist() == [2] * 4 and compared["pairs"].tolist() == [0, 2] * 2
+
+
+@pytest.mark.parametrize("older", [False, True])
+@pytest.mark.parametrize("count", [0, 3])
+@pytest.mark.parametrize("names", [["curves"], ["curves", "episodes"]])
+def test_a_sweep_that_was_killed_between_two_tables_has_no_half_lanes(
+    names, count, older, whole, tmp_path
+):
+    killed = killed_after(whole, count, tmp_path / "killed")
+    if older:  # the lane ended while the first tables were being written
+        for file in killed.path.glob("lanes/*/*.safetensors"):
+            os.utime(file, (1, 1))
+    for name in names:  # they were written with all lanes; the others were not yet
+        shutil.copy(whole.path / f"{name}.parquet", killed.path)
+    assert same(current_tables(killed), current_tables(whole))
+
+
+def extend(run, steps):
+    """The run whose first cell is to be trained to ``steps``, from checkpoints."""
+    cell, *others = run.cells
+    for seed in run.seeds:
+        kept = run.lanes.checkpoint_directory(cell, seed)
+        kept.mkdir(parents=True)
+        (kept / f"step-{STEPS[-1]:09d}.safetensors").touch()
+    longer = dataclasses.replace(cell, config=dataclasses.replace(cell.config, total_steps=steps))
+    return RunDirectory.create(run.path, [longer, *others], run.seeds, run.episodes)
+
+
+def test_results_of_fewer_steps_are_not_those_of_a_study_with_more(whole, tmp_path):
+    shutil.copytree(whole.path, tmp_path / "before")
+    before, run = RunDirectory.open(tmp_path / "before"), extend(whole, 80)
+    (cell, other), steps = run.cells, [*STEPS, 80]
+    tables = current_tables(run)
+    trained = tables["episodes"][tables["episodes"]["seed"] >= 0]
+    assert set(trained["algorithm"]) == {"h-td3"} and len(trained) == 4
+    assert set(tables["curves"]["algorithm"]) == {"h-td3"}
+    data = page_data(run, complete=False, playback=False)
+    assert [cell["final"]["return"] is None for cell in data["cells"]] == [True, False]
+    assert data["notes"] == []
+    assert set(compare_runs([before, run], ["before", "run"])["algorithm"]) == {"h-td3"}
+
+    curves = {"steps": np.array(steps), "returns": np.zeros(4), "true_returns": np.zeros(4)}
+    curves |= {"final_returns": np.zeros(2), "final_true_returns": np.zeros(2)}
+    run.lanes.write_lane(cell, 0, {}, curves, {}, None)
+    found = current_tables(run)["curves"]
+    assert found[found["algorithm"] == "td3"]["step"].tolist() == steps
+    assert len(found[found["algorithm"] == other.config.algorithm]) == 2 * len(STEPS)
 
 
 def test_a_lane_that_was_trained_again_replaces_its_rows(whole):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import rtd3jax as rtd
-from rtd3jax.study import time_estimate
+from rtd3jax.study import plan, time_estimate
 from rtd3jax.training.run import make_jobs
 
 
@@ -36,6 +36,52 @@ def test_what_is_not_timed_lies_between_what_is(monkeypatch):
     assert len(asked) == time_estimate.MOST_PROGRAMS and {1, 7} <= set(asked)
     # Side by side, each of a program's lanes has a worker of its own here.
     assert time_estimate.study_seconds(jobs, "vmap", operations) == pytest.approx(280)
+
+
+@pytest.mark.parametrize(
+    ("strategy", "workers", "lanes", "at_once", "seconds", "measured"),
+    [
+        ("map", 64, 5, None, 10.0, [1] * 5),  # each lane has a core, and no lane has two
+        ("map", 4, 10, None, 25.0, [1] * 4),
+        ("map", 4, 10, 2, 50.0, [1] * 2),  # of four cores, two have no memory for a lane
+        ("vmap", 1, 10, None, 10.0, [10]),
+        ("vmap", 1, 10, 4, 30.0, [4]),  # three waves
+        ("vmap", 2, 10, 4, 20.0, [4, 4]),
+        ("vmap", 2, 3, None, 10.0, [2, 2]),
+        ("vmap", 2, 1, None, 10.0, [1]),
+    ],
+)
+def test_the_plan_decides_what_is_measured_and_how_often_it_is_repeated(
+    strategy, workers, lanes, at_once, seconds, measured, monkeypatch
+):
+    jobs, found = _jobs("td3", seeds=lanes), []
+
+    def timed(group, device, together):
+        found.append(len(group))
+        return 10.0 / 800, 0.0
+
+    monkeypatch.setattr(time_estimate, "workers", lambda: [None] * workers)
+    monkeypatch.setattr(time_estimate, "_timed", timed)
+    estimate = time_estimate.study_seconds(jobs, strategy, lambda config: 1.0, at_once=at_once)
+    assert estimate == pytest.approx(seconds) and found == measured
+
+
+def test_the_longest_lane_is_a_lower_bound(monkeypatch):
+    jobs = [*_jobs("td3", seeds=3), *_jobs("td3", seeds=1, total_steps=8_000)]
+    seconds = lambda group: group[0].program.config.total_steps / 1_000  # noqa: E731
+    monkeypatch.setattr(time_estimate, "group_seconds", seconds)
+    monkeypatch.setattr(time_estimate, "workers", lambda: [None] * 2)
+    operations = lambda config: float(config.total_steps)  # noqa: E731
+    assert time_estimate.study_seconds(jobs, "map", operations) == pytest.approx(8.0)
+
+
+def test_a_dry_run_counts_the_lanes_that_wait_for_memory(monkeypatch):
+    jobs, asked = _jobs("td3", seeds=4), []
+    monkeypatch.setattr(plan, "workers", lambda: [jax.devices()[0]] * 4)
+    monkeypatch.setattr(plan, "study_seconds", lambda *given: asked.append(given[-1]) or 60.0)
+    monkeypatch.setattr(plan, "lanes_at_once", lambda *_: 3)
+    text = plan.plan_text([], range(4), jobs, "map", 2**30)
+    assert asked == [3] and "3; the other 1 wait" in text
 
 
 def test_a_lane_is_timed_without_its_random_steps(monkeypatch):
