@@ -9,10 +9,15 @@ import numpy as np
 import pandas as pd
 from effects import FEWEST_SEEDS, Effect
 from pendulum_cells import current_setting
+from settings import setting_text
 
 from rtd3jax.study import presets
 
 CELL = ["algorithm", "disturbance", "history_length"]
+ROVER_SETTING = setting_text({**presets.ROVER_SETTINGS, "total_steps": presets.ROVER_STEPS})
+"""The setting of the rover's trainings; the table may have rows of earlier settings."""
+LONGER = "pendulum_longer/pendulum"
+"""The table of trainings with twice the steps (`pendulum.py --steps 60000`)."""
 
 
 Cells = dict[int, np.ndarray]
@@ -100,19 +105,24 @@ class Results:
     carried: Trainings
     """Returns, under other disturbances, of agents that were trained under `random-sine`."""
     bench: pd.DataFrame
+    longer: Trainings = Trainings(pd.DataFrame())
+    """Final returns after twice the steps."""
 
     @classmethod
     def read(cls, directory: pathlib.Path) -> "Results":
         """Read the directory of results."""
-        names = ("rover", "pendulum", "pendulum_curves", "generalisation")
+        names = ("rover", "pendulum", "pendulum_curves", "generalisation", LONGER)
         files = [directory / f"{name}.parquet" for name in names]
         tables = [pd.read_parquet(file) if file.exists() else pd.DataFrame() for file in files]
         rover, *of_the_pendulum = tables
-        pendulum, curves, generalisation = map(current, of_the_pendulum)
+        if "setting" in rover:
+            rover = rover[rover["setting"] == ROVER_SETTING]
+        pendulum, curves, generalisation, longer = map(current, of_the_pendulum)
         bench = directory / "benchmarks" / "measurements.csv"
         rates = pd.read_csv(bench) if bench.exists() else pd.DataFrame()
         carried = generalisation.rename(columns={"tested_on": "disturbance"})
-        return cls(rover, Trainings(pendulum), curves, Trainings(carried), rates)
+        returns = Trainings(pendulum), curves, Trainings(carried)
+        return cls(rover, *returns, rates, Trainings(longer))
 
     def on_rover(self, algorithm: str, trained: str, tested: str = "ar1-slip") -> np.ndarray:
         """Mean return of each seed: float [seeds]; empty without results."""

@@ -18,6 +18,8 @@ each reject a difference beyond the margin exactly if the 90% interval lies with
 FIRST_SEEDS, SECOND_SEEDS = 5, 15
 """The most seeds of a cell at the first test of a comparison, and at the second test. Each cell
 with more than ``SECOND_SEEDS`` got them after a further test."""
+FAILED = -0.1
+"""A training with a lower normalised return has failed: random actions have 0."""
 SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "undecided"
 NO_EFFECT = "no effect"
 
@@ -33,6 +35,13 @@ def cells_of(values: Values, weight: float = 1.0) -> list[tuple[float, np.ndarra
     if isinstance(values, np.ndarray):
         return [(weight, values)]
     return [cell for part in values for cell in cells_of(part, weight / len(values))]
+
+
+def first(values: Values, count: int) -> Values:
+    """The first ``count`` seeds of each cell."""
+    if isinstance(values, np.ndarray):
+        return values[:count]
+    return [first(part, count) for part in values]
 
 
 def mean_interval(values: np.ndarray, confidence: float = CONFIDENCE) -> tuple[float, float, float]:
@@ -58,7 +67,9 @@ class Effect:
 
     Cells got more seeds if a comparison was undecided, so the comparison was tested again. Each of
     its tests has an equal share of the error (Bonferroni): with 15 seeds in a cell, the intervals
-    have a confidence of 97.5% instead of 95%.
+    have a confidence of 97.5% instead of 95%. ``other_tests`` counts tests that do not show in the
+    number of seeds, such as those before a window length was added. Returns below ``failed`` belong
+    to failed trainings.
     """
 
     name: str
@@ -67,6 +78,8 @@ class Effect:
     margin: float = MARGIN
     paired: bool = False
     factor: float = 1.0
+    other_tests: int = 0
+    failed: float = FAILED
     parts: tuple["Effect", ...] = ()
 
     def looks(self) -> int:
@@ -78,7 +91,31 @@ class Effect:
         # A cell may occur at several window lengths.
         cells = {id(cell): cell for side in sides for _, cell in cells_of(side)}.values()
         second = any(len(cell) > FIRST_SEEDS for cell in cells)
-        return 1 + second + sum(len(cell) > SECOND_SEEDS for cell in cells)
+        later = sum(len(cell) > SECOND_SEEDS for cell in cells)
+        return 1 + second + later + self.other_tests
+
+    def even(self) -> "Effect":
+        """The effect with the first seeds of each cell: as many as the smallest cell of its side.
+
+        Cells got more seeds where trainings failed. If one training in ten fails, six of ten cells
+        with five seeds show no failure, and their variance does not tell that they may have some.
+        Then a mean over cells with different numbers of seeds is less certain than its interval
+        says. With the seeds that were planned for all cells, failures count as often as they occur.
+        """
+        better, worse = (
+            first(side, count)
+            for side, count in zip((self.better, self.worse), self.seeds(), strict=True)
+        )
+        return dataclasses.replace(self, better=better, worse=worse)
+
+    def has_failures(self) -> bool:
+        """Whether trainings failed on a side whose cells differ in their numbers of seeds."""
+        for side in (self.better, self.worse):
+            cells = [cell for _, cell in cells_of(side)]
+            uneven = len({len(cell) for cell in cells}) > 1
+            if uneven and any((cell < self.failed).any() for cell in cells):
+                return True
+        return False
 
     def seeds(self) -> tuple[int, int]:
         """The fewest seeds of a cell, of each side."""
@@ -114,8 +151,12 @@ class Effect:
         return mean, mean - half, mean + half
 
     def bound(self) -> float:
-        """The smallest margin within which the two one-sided tests find no difference."""
-        _, low, high = self.interval(EQUIVALENCE)
+        """The smallest margin within which the two one-sided tests find no difference.
+
+        If trainings failed, the tests are those of `even`.
+        """
+        effect = self.even() if self.has_failures() else self
+        _, low, high = effect.interval(EQUIVALENCE)
         return max(-low, high)
 
     def verdict(self) -> str:
@@ -133,7 +174,10 @@ class Effect:
             better, worse = self.seeds()
             return f"{self.name}: too few seeds ({better}, {worse})"
         mean, low, high = self.interval()
-        none = f", no effect beyond ±{self.bound():.3f}" if low <= 0 <= high else ""
+        none = ""
+        if low <= 0 <= high:
+            even = " (with the same seeds in all cells)" * self.has_failures()
+            none = f", no effect beyond ±{self.bound():.3f}{even}"
         looks = self.looks()
         tested = {1: "", 2: " (tested twice)"}.get(looks, f" (tested {looks} times)")
         return f"{self.name}: {mean:+.3f} [{low:+.3f}, {high:+.3f}]{none}{tested}"

@@ -14,8 +14,9 @@ Then the script tests each agent under its own disturbance, and the agents of `r
 five other conditions, in 1,000 episodes each. It writes pendulum.md and .parquet, generalisation.md
 and .parquet, pendulum_curves.parquet, and the pictures of experiments/pendulum_figures.py. The
 paper has five seeds, lengths 1 to 20 and width 128; the table states what was run. `--report` does
-not train: it reads all run directories in DIR, also incomplete studies. Other rows of the table do
-not change; rows of earlier settings are marked.
+not train: it reads all run directories in DIR, also incomplete studies, if there are any, and draws
+the tables and pictures again. Other rows of the table do not change; rows of earlier settings are
+marked.
 
 Returns are normalised: 0 is the uniform random policy, 1 is the fully observed optimum.
 """
@@ -38,8 +39,10 @@ from rtd3jax.study.transfer import transfer
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from continuing import train_missing  # noqa: E402
+from effects import FAILED  # noqa: E402
 from pendulum_cells import (  # noqa: E402
-    CLEAN_NOISE,
+    BEYOND_THE_PAPER,
+    HARD_BIAS,
     cells,
     current_setting,
     in_the_paper,
@@ -50,6 +53,7 @@ from pendulum_figures import draw_all, filter_returns  # noqa: E402
 from settings import mark, notes, setting_text  # noqa: E402
 from writing import (  # noqa: E402
     RESULTS,
+    check_steps,
     markdown_table,
     mean_text,
     parse,
@@ -61,7 +65,7 @@ CONDITIONS = (
     "random-sine",
     "combined-sine",
     "damped-sine",
-    "temporal-bias:amplitude_min=1.0,amplitude_max=1.0",
+    HARD_BIAS,
     "noise:sigma=1.0",
 )
 """Conditions for tests of the agents of `random-sine` (the paper's generalisation figure)."""
@@ -70,7 +74,7 @@ LENGTHS = (6, 20, 1, 3, 10)
 ALL_DISTURBANCES = (
     *presets.PENDULUM_DISTURBANCES,
     *presets.ACTION_HISTORY_DISTURBANCES,
-    CLEAN_NOISE,
+    *BEYOND_THE_PAPER,
 )
 SEEDS = 5
 """The paper's seeds."""
@@ -79,8 +83,6 @@ TEST_EPISODES = 1_000
 EARLIER_EPISODES = 20
 """The episodes of rows of an old table, which has no column of that name."""
 REFERENCE_EPISODES = 1_000
-FAILED = -0.1
-"""An agent with a lower normalised return is worse than uniform random actions."""
 
 
 @functools.cache
@@ -145,6 +147,8 @@ def with_others(lanes: pd.DataFrame, path: pathlib.Path, column: str) -> pd.Data
     kept = pd.read_parquet(path)
     if "setting" not in kept:
         kept["setting"] = "the configuration's defaults"  # as in all tables without this column
+    if lanes.empty:
+        return kept
     key = ["algorithm", "history_length", column, "seed"]
     replaced = pd.MultiIndex.from_frame(kept[key]).isin(pd.MultiIndex.from_frame(lanes[key]))
     return pd.concat([lanes, kept[~replaced]], ignore_index=True)
@@ -246,39 +250,54 @@ def once(rows: pd.DataFrame, key: list[str], settings: list[str]) -> pd.DataFram
     return rows
 
 
-def report(options: argparse.Namespace, episodes: int, began: float) -> int:
-    """Write tables and pictures of the run directories in ``options.run``."""
-    runs = [path.parent for path in sorted(options.run.rglob("config.json"))]
-    found = {run: rows for run in runs if len(rows := all_tested(run, episodes))}
+def tested_in(run: pathlib.Path, episodes: int) -> tuple[list[pathlib.Path], pd.DataFrame]:
+    """The run directories in ``run`` with trained lanes, and their rows of `all_tested`."""
+    paths = [path.parent for path in sorted(run.rglob("config.json"))]
+    found = {path: rows for path in paths if len(rows := all_tested(path, episodes))}
     if not found:
-        print(f"nothing is trained in {options.run} yet")
-        return 1
+        return [], pd.DataFrame(columns=["algorithm", "trained_on", "tested_on"])
     rows = pd.concat(found.values(), ignore_index=True)
     # Two directories may hold the same training, whose returns are then the same.
-    rows = once(rows, [*KEY, "trained_on", "tested_on"], ["setting", "steps", "width"])
+    return list(found), once(rows, [*KEY, "trained_on", "tested_on"], ["setting", "steps", "width"])
+
+
+def curves_in(runs: list[pathlib.Path]) -> pd.DataFrame:
+    """`curves_of` each of the run directories."""
+    if not runs:
+        return pd.DataFrame()
+    curves = pd.concat([curves_of(run) for run in runs], ignore_index=True)
+    return once(curves, [*KEY, "disturbance", "step"], ["setting"])
+
+
+def report(options: argparse.Namespace, episodes: int, began: float) -> int:
+    """Write tables and pictures: the rows of the runs in ``options.run``, and those kept before."""
+    runs, rows = tested_in(options.run, episodes)
+    files = {name: options.out / f"{name}.parquet" for name in ("pendulum", "generalisation")}
+    if not runs:
+        print(f"nothing is trained in {options.run} yet")
+        if not files["pendulum"].exists():
+            return 1
     lanes = rows[rows["trained_on"] == rows["tested_on"]].drop(columns="trained_on")
     lanes = lanes.rename(columns={"tested_on": "disturbance", "true_return": "mean"})
-    lanes = with_others(lanes, options.out / "pendulum.parquet", "disturbance")
+    lanes = with_others(lanes, files["pendulum"], "disturbance")
     lanes = lanes.drop(columns="return", errors="ignore")  # which an earlier version kept
     lanes["episodes"] = lanes["episodes"].fillna(EARLIER_EPISODES).astype(int)
     filtered = filter_returns(options.out)
     text = table(lanes, "disturbance", ALL_DISTURBANCES, filtered)
     about = {**facts(lanes, began), f"trainings_below_{FAILED}": failed(lanes)}
     write_results(options.out, "pendulum", lanes, text, about)
-    curves = pd.concat([curves_of(run) for run in found], ignore_index=True)
-    curves = once(curves, [*KEY, "disturbance", "step"], ["setting"])
     curves_file = options.out / "pendulum_curves.parquet"
-    with_others(curves, curves_file, "disturbance").to_parquet(curves_file, index=False)
+    with_others(curves_in(runs), curves_file, "disturbance").to_parquet(curves_file, index=False)
     print(text)
     carried = rows[rows["trained_on"] == "random-sine"].drop(columns="trained_on")
-    if carried.empty:
+    moved = with_others(carried, files["generalisation"], "tested_on")
+    if moved.empty:
         print("missing: generalisation: nothing is trained on random-sine")
     else:
-        moved = with_others(carried, options.out / "generalisation.parquet", "tested_on")
         text = table(moved, "tested_on", CONDITIONS, filtered)
-        under = lanes[lanes["disturbance"] == "random-sine"]
-        about = {**facts(under, began), "episodes": episodes}
-        write_results(options.out, "generalisation", moved, text, about)
+        write_results(
+            options.out, "generalisation", moved, text, facts(moved.drop_duplicates(KEY), began)
+        )
         print(text)
     draw_all(options.out, options.out)
     return 0
@@ -326,8 +345,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--algorithms", nargs="+", metavar="A", default=list(rtd.ALGORITHMS))
     parser.add_argument("--report", action="store_true", help="no training")
     options = parse(parser, arguments)
-    if options.steps != presets.PENDULUM_STEPS and options.out.resolve() == RESULTS.resolve():
-        parser.error(f"with --steps {options.steps}, choose another --out")
+    check_steps(parser, options, presets.PENDULUM_STEPS)
     began, episodes = time.time(), TEST_EPISODES
     tiny: dict[str, object] = {}
     if options.quick:

@@ -42,6 +42,7 @@ from rover import PAPER as PAPER_RETURNS  # noqa: E402
 from settings import setting_text  # noqa: E402
 from writing import (  # noqa: E402
     RESULTS,
+    check_steps,
     markdown_table,
     mean_text,
     parse,
@@ -179,6 +180,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--algorithms", nargs="+", choices=WITH_WINDOW, default=[*WITH_WINDOW])
     parser.add_argument("--report", action="store_true", help="test without training")
     options = parse(parser, arguments)
+    check_steps(parser, options, ROVER_STEPS)
     began, episodes, seeds = time.time(), EPISODES, range(SEEDS)
     tiny: dict[str, object] = {}
     if options.quick:

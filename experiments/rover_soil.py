@@ -40,7 +40,7 @@ from continuing import (  # noqa: E402
 )
 from rover import EPISODES, SEEDS, TINY  # noqa: E402
 from rover_soil_report import GROUNDS, SLIPS, SOIL, UNTRAINED, draw, tables  # noqa: E402
-from writing import RESULTS, parse, provenance, say, write_results  # noqa: E402
+from writing import RESULTS, check_steps, parse, provenance, say, write_results  # noqa: E402
 
 SOURCES = ("sine-slip", SOIL, "ar1-slip")
 """The slips and grounds of the trainings, in an order that soon gives a useful table."""
@@ -131,6 +131,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--sources", nargs="+", choices=SOURCES, default=list(SOURCES), metavar="S")
     parser.add_argument("--report", action="store_true", help=UNTRAINED)
     options = parse(parser, arguments)
+    check_steps(parser, options, STEPS)
     began, steps, episodes, seeds = time.time(), options.steps, EPISODES, SEEDS
     tiny: dict[str, object] = {}
     grounds = GROUNDS

@@ -43,6 +43,12 @@ def parse(
     return options
 
 
+def check_steps(parser: argparse.ArgumentParser, options: argparse.Namespace, usual: int) -> None:
+    """End the script if trainings of another number of steps would replace rows of the results."""
+    if options.steps != usual and options.out.resolve() == RESULTS.resolve():
+        parser.error(f"with --steps {options.steps}, choose another --out")
+
+
 def provenance(**facts: object) -> dict[str, object]:
     """Facts about a run, with versions, device and date."""
     return {

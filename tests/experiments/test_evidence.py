@@ -1,6 +1,7 @@
 """Runs the experiments with --quick."""
 
 import argparse
+import json
 import re
 import shutil
 import sys
@@ -238,11 +239,16 @@ def test_the_pendulum_experiment_runs(tmp_path, capsys, monkeypatch):
     said = capsys.readouterr().out
     assert "has 0 of 1 cells" in said and "not run" in said and "†" not in said
 
-    # What stands in the table is not trained again, wherever it was trained.
+    # What stands in the table is not trained again, wherever it was trained, but written again.
     monkeypatch.setattr(pendulum, "draw_all", lambda *_: None)
     elsewhere = tmp_path / "elsewhere"
-    assert pendulum.main([*quick, "--run", str(elsewhere)]) == 1
+    tables = [out / f"{name}.md" for name in ("pendulum", "generalisation")]
+    before = [file.read_text().partition("- minutes")[0] for file in tables]
+    for file in tables:
+        file.unlink()
+    assert pendulum.main([*quick, "--run", str(elsewhere)]) == 0
     assert "has 1 of 1 cells" in capsys.readouterr().out and not elsewhere.exists()
+    assert [file.read_text().partition("- minutes")[0] for file in tables] == before
 
     # A further seed joins those of the table. In the study of the others, they would be continued.
     with pytest.raises(SystemExit, match=r"holds other seeds \(0 to 0\).* choose another --run"):
@@ -255,7 +261,7 @@ def test_the_pendulum_experiment_runs(tmp_path, capsys, monkeypatch):
     lanes = run / "lanes"
     lanes.rename(run / "aside")
     again = ["--report", "--run", str(run)]
-    assert pendulum.main([*quick, *again]) == 1
+    assert pendulum.main([*quick, *again]) == 0
     assert "missing: trained on random-sine" in capsys.readouterr().out
     (run / "aside").rename(lanes)
 
@@ -270,6 +276,7 @@ def test_the_pendulum_experiment_runs(tmp_path, capsys, monkeypatch):
 
     # Cells of a table from before settings were noted stay, and are marked.
     table.reset_index().drop(columns=["setting", "episodes"]).to_parquet(out / "pendulum.parquet")
+    (out / "generalisation.parquet").unlink()
     more = ["--disturbances", "hidden", "--algorithms", "td3", "--run", str(tmp_path / "more")]
     assert pendulum.main([*quick, *more]) == 0
     both = pd.read_parquet(out / "pendulum.parquet").set_index(["algorithm", "disturbance"])
@@ -280,8 +287,9 @@ def test_the_pendulum_experiment_runs(tmp_path, capsys, monkeypatch):
     assert "† trained with the configuration's defaults" in said
     # Before the first lane ends there is nothing to report.
     shutil.rmtree(tmp_path / "more" / "lanes")
-    assert pendulum.main([*quick, *more, "--report"]) == 1
+    assert pendulum.main([*quick, *more, "--report"]) == 0
     assert "nothing is trained" in capsys.readouterr().out
+    assert pendulum.main([*quick, *more, "--report", "--out", str(tmp_path / "empty")]) == 1
 
     pictures = load(EXPERIMENTS / "pendulum_pictures.py")
     assert pictures.main(["--quick", "--run", str(run), "--out", str(out)]) == 0
@@ -301,6 +309,13 @@ def test_the_sixth_agent_has_a_setting_of_its_own_and_twice_the_steps():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name, of_a_lane", [("pendulum", 1), ("generalisation", 5)])
+def test_the_pendulums_tables_state_what_their_files_hold(name, of_a_lane):
+    """Tables, pictures and claims are of the same trainings."""
+    lanes = json.loads((EXPERIMENTS / "results" / f"{name}.json").read_text())["lanes"]
+    assert lanes * of_a_lane == len(pd.read_parquet(EXPERIMENTS / "results" / f"{name}.parquet"))
+
+
 def test_pairs_of_precisions_are_compared(tmp_path):
     pairs = load(EXPERIMENTS / "bfloat16_returns.py")
     options = ["--quick", "--run", str(tmp_path / "run"), "--out", str(tmp_path)]
