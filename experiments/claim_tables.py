@@ -31,6 +31,7 @@ def compare(
     worse: list[Cells],
     kind: type[Effect] = Effect,
     lengths: Collection[int] | None = None,
+    other_tests: int = 0,
     **fields: Any,
 ) -> Effect:
     """The effect between means of cells, with the same window lengths on both sides.
@@ -38,7 +39,7 @@ def compare(
     While the trainings are incomplete, some cells may have window lengths that others lack. Only
     lengths that all cells have count (and of these only ``lengths``, if they are given). An agent
     without a window counts with every length. The parts of the effect are the effects at each
-    length. ``fields`` are other fields of the effect.
+    length, to which ``other_tests`` do not apply. ``fields`` are other fields of the effect.
     """
     windows = [set(cells) for cells in (*better, *worse) if set(cells) != {0}]
     shared = set.intersection(*windows) if windows else set()
@@ -54,7 +55,7 @@ def compare(
 
     parts = [between(f"l = {length}", [length]) for length in shared] if len(shared) > 1 else []
     listed = f" (l = {', '.join(map(str, shared))})" if shared else ""
-    return between(f"{name}{listed}", shared, parts=tuple(parts))
+    return between(f"{name}{listed}", shared, parts=tuple(parts), other_tests=other_tests)
 
 
 @dataclasses.dataclass(frozen=True)

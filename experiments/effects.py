@@ -100,7 +100,8 @@ class Effect:
         Cells got more seeds where trainings failed. If one training in ten fails, six of ten cells
         with five seeds show no failure, and their variance does not tell that they may have some.
         Then a mean over cells with different numbers of seeds is less certain than its interval
-        says. With the seeds that were planned for all cells, failures count as often as they occur.
+        says. With the seeds that were planned for all cells, failures count as often as they occur;
+        with all seeds, those count that were seen later. So `interval` contains both intervals.
         """
         better, worse = (
             first(side, count)
@@ -109,11 +110,14 @@ class Effect:
         return dataclasses.replace(self, better=better, worse=worse)
 
     def has_failures(self) -> bool:
-        """Whether trainings failed on a side whose cells differ in their numbers of seeds."""
+        """Whether some trainings failed on a side whose cells differ in their numbers of seeds.
+
+        A cell in which all trainings are below ``failed`` has no rare failures, but low returns.
+        """
         for side in (self.better, self.worse):
             cells = [cell for _, cell in cells_of(side)]
             uneven = len({len(cell) for cell in cells}) > 1
-            if uneven and any((cell < self.failed).any() for cell in cells):
+            if uneven and any(0 < (cell < self.failed).mean() < 1 for cell in cells):
                 return True
         return False
 
@@ -124,14 +128,25 @@ class Effect:
         return better, worse
 
     def interval(self, confidence: float = CONFIDENCE) -> tuple[float, float, float]:
+        """The difference of means and its interval; the error is divided by `looks`.
+
+        If `has_failures`, the interval also contains the interval of `even`.
+        """
+        confidence = 1.0 - (1.0 - confidence) / self.looks()
+        mean, low, high = self._single_interval(confidence)
+        if self.has_failures():
+            _, low_even, high_even = self.even()._single_interval(confidence)
+            low, high = min(low, low_even), max(high, high_even)
+        return mean, low, high
+
+    def _single_interval(self, confidence: float) -> tuple[float, float, float]:
         """The difference of means and its interval, Welch's (1947) unless the sides are paired.
 
         The mean of a side is the mean of its cells' means. Each cell of either side has its own
         variance, and the sum has the degrees of freedom of Welch and Satterthwaite; with one cell
         on each side, this is Welch's interval. If the sides are paired, the differences within
-        pairs count. The error, which is one minus ``confidence``, is divided by `looks`.
+        pairs count.
         """
-        confidence = 1.0 - (1.0 - confidence) / self.looks()
         better = cells_of(self.better, self.factor)
         worse = cells_of(self.worse, self.factor)
         if self.paired:
@@ -151,12 +166,8 @@ class Effect:
         return mean, mean - half, mean + half
 
     def bound(self) -> float:
-        """The smallest margin within which the two one-sided tests find no difference.
-
-        If trainings failed, the tests are those of `even`.
-        """
-        effect = self.even() if self.has_failures() else self
-        _, low, high = effect.interval(EQUIVALENCE)
+        """The smallest margin within which the two one-sided tests find no difference."""
+        _, low, high = self.interval(EQUIVALENCE)
         return max(-low, high)
 
     def verdict(self) -> str:
@@ -174,13 +185,12 @@ class Effect:
             better, worse = self.seeds()
             return f"{self.name}: too few seeds ({better}, {worse})"
         mean, low, high = self.interval()
-        none = ""
-        if low <= 0 <= high:
-            even = " (with the same seeds in all cells)" * self.has_failures()
-            none = f", no effect beyond ±{self.bound():.3f}{even}"
+        none = f", no effect beyond ±{self.bound():.3f}" if low <= 0 <= high else ""
         looks = self.looks()
-        tested = {1: "", 2: " (tested twice)"}.get(looks, f" (tested {looks} times)")
-        return f"{self.name}: {mean:+.3f} [{low:+.3f}, {high:+.3f}]{none}{tested}"
+        remarks = [{1: "", 2: "tested twice"}.get(looks, f"tested {looks} times")]
+        remarks += ["trainings failed"] * self.has_failures()
+        remark = f" ({'; '.join(filter(None, remarks))})" if any(remarks) else ""
+        return f"{self.name}: {mean:+.3f} [{low:+.3f}, {high:+.3f}]{none}{remark}"
 
 
 def combine(verdicts: list[str]) -> str:

@@ -154,6 +154,12 @@ def with_others(lanes: pd.DataFrame, path: pathlib.Path, column: str) -> pd.Data
     return pd.concat([lanes, kept[~replaced]], ignore_index=True)
 
 
+def with_whole_numbers(lanes: pd.DataFrame) -> pd.DataFrame:
+    """``lanes`` with integers in the columns of `facts`, also from old tables that lacked one."""
+    lanes = lanes.assign(episodes=lanes["episodes"].fillna(EARLIER_EPISODES))
+    return lanes.astype(dict.fromkeys(("steps", "width", "episodes"), int))
+
+
 def of_each(lanes: pd.DataFrame, column: str) -> str:
     """The value of ``column`` in most lanes, and the agents of lanes that have other values."""
     usual = lanes[column].mode()[0]
@@ -280,20 +286,22 @@ def report(options: argparse.Namespace, episodes: int, began: float) -> int:
     lanes = rows[rows["trained_on"] == rows["tested_on"]].drop(columns="trained_on")
     lanes = lanes.rename(columns={"tested_on": "disturbance", "true_return": "mean"})
     lanes = with_others(lanes, files["pendulum"], "disturbance")
-    lanes = lanes.drop(columns="return", errors="ignore")  # which an earlier version kept
-    lanes["episodes"] = lanes["episodes"].fillna(EARLIER_EPISODES).astype(int)
+    lanes = with_whole_numbers(lanes.drop(columns="return", errors="ignore"))  # of an old version
     filtered = filter_returns(options.out)
     text = table(lanes, "disturbance", ALL_DISTURBANCES, filtered)
     about = {**facts(lanes, began), f"trainings_below_{FAILED}": failed(lanes)}
     write_results(options.out, "pendulum", lanes, text, about)
     curves_file = options.out / "pendulum_curves.parquet"
-    with_others(curves_in(runs), curves_file, "disturbance").to_parquet(curves_file, index=False)
+    curves = with_others(curves_in(runs), curves_file, "disturbance")
+    if len(curves):
+        curves.to_parquet(curves_file, index=False)
     print(text)
     carried = rows[rows["trained_on"] == "random-sine"].drop(columns="trained_on")
     moved = with_others(carried, files["generalisation"], "tested_on")
     if moved.empty:
         print("missing: generalisation: nothing is trained on random-sine")
     else:
+        moved = with_whole_numbers(moved)
         text = table(moved, "tested_on", CONDITIONS, filtered)
         write_results(
             options.out, "generalisation", moved, text, facts(moved.drop_duplicates(KEY), began)

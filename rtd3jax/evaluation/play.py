@@ -49,9 +49,10 @@ def parts_of(env: EnvironmentLike, episodes: int) -> list[tuple[int, Part | None
     Only a simulator limits these numbers; otherwise there is one number, without a `Part`.
     """
     fleet = fleet_of(env)
-    if fleet is None or episodes <= fleet.most:
+    # Lanes that train at the same time need simulators of the same fleet, too.
+    most = episodes if fleet is None else max(1, fleet.most // 2)
+    if episodes <= most:
         return [(episodes, None)]
-    most = fleet.most
     firsts = range(0, episodes, most)
     return [(min(most, episodes - k), Part(jnp.int32(k), episodes)) for k in firsts]
 

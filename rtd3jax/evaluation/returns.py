@@ -29,7 +29,7 @@ def evaluate(
     Args:
         policy: anything with ``init`` and ``step``; see `rtd3jax.policies`.
         env: a gymnax >= 1.0 environment.
-        episodes: number of episodes, played together; a simulator plays at most 1,024 of them
+        episodes: number of episodes, played together; a simulator plays at most 512 of them
             together, and more of them in parts.
         seed: seed of the environment's random streams; equal seeds give equal starts and
             disturbances for all policies.

@@ -43,7 +43,7 @@ from rtd3jax.training.loop import (
 )
 from rtd3jax.training.plant import plant_of
 from rtd3jax.training.progress import Progress
-from rtd3jax.training.start import IN_MEMORY, Start, starts_of_path, starts_or_why_not
+from rtd3jax.training.start import IN_MEMORY, Start, starts_if_needed, starts_of_path
 
 _REASONS = {
     ENVIRONMENT_NOT_FINITE: "the environment returned an observation or reward that is not finite; "
@@ -183,7 +183,7 @@ def train(
         UserError: for an unsuitable environment, impossible arguments or checkpoints of another
             training, before compilation.
         Exception: an error in a lane; at once, or with ``checkpoint_dir`` when the other lanes have
-            ended, whose checkpoints are then complete.
+            ended, whose checkpoints are then complete, unless a warning said otherwise.
     """
     single = isinstance(config, Config)
     configs = [config] if isinstance(config, Config) else as_list(config)
@@ -374,7 +374,7 @@ def _starts(
     if isinstance(start, str | Path):
         if directory is None:
             return starts_of_path(start, seeds)
-        return starts_or_why_not(start, {seed: lane_directory(directory, seed) for seed in seeds})
+        return starts_if_needed(start, {seed: lane_directory(directory, seed) for seed in seeds})
     raise UserError(
         "start must be a policy, a run of rtd.train, the path of a saved policy, or a directory "
         f"of checkpoints, not {start!r}"

@@ -5,6 +5,7 @@ contains the critics, the targets and the optimisers. The replay, the state of t
 the random numbers always belong to the new lane.
 """
 
+import contextlib
 import dataclasses
 import functools
 from collections.abc import Mapping
@@ -192,7 +193,7 @@ def starts_of_path(path: str | Path, seeds: tuple[int, ...]) -> dict[int, Start]
     return found
 
 
-def starts_or_why_not(path: str | Path, directories: Mapping[int, Path]) -> dict[int, Start]:
+def starts_if_needed(path: str | Path, directories: Mapping[int, Path]) -> dict[int, Start]:
     """`starts_of_path` for each seed of ``directories``, which may hold checkpoints of its lane.
 
     A lane with checkpoints that began from ``path`` does not need it any more: if it cannot be
@@ -201,6 +202,8 @@ def starts_or_why_not(path: str | Path, directories: Mapping[int, Path]) -> dict
     Raises:
         UserError: as `starts_of_path` does, for any other lane.
     """
+    with contextlib.suppress(UserError):
+        return starts_of_path(path, tuple(directories))
     found: dict[int, Start] = {}
     for seed, directory in directories.items():
         try:

@@ -73,7 +73,7 @@ def test_cells_count_equally_whatever_their_seeds():
             [chance.normal(mean, spread, seeds) for mean, spread, seeds in side]
             for side in (cells, other)
         )
-        found.append(effects.Effect("", better, worse).interval())
+        found.append(effects.Effect("", better, worse, failed=-np.inf).interval())
     middle, low, high = np.transpose(found)
     assert middle.mean() == pytest.approx((0.0 + 3.0) / 2 - 1.0, abs=0.02)
     # A cell with 15 seeds was tested twice, so the error is half as large.
@@ -100,7 +100,7 @@ def test_paired_cells_are_compared_within_their_pairs():
     common = [chance.normal(0, 10, seeds) for seeds in (5, 15)]
     own = [chance.normal(1, 0.1, len(cell)) for cell in common]
     better = [cell + more for cell, more in zip(common, own, strict=True)]
-    found = effects.Effect("", better, common, paired=True).interval()
+    found = effects.Effect("", better, common, paired=True, failed=-np.inf).interval()
     assert found == pytest.approx(effects.Effect("", own, [np.zeros(5), np.zeros(15)]).interval())
     mean, low, high = effects.Effect("", better, common).interval()
     assert mean == pytest.approx(found[0]) and high - low > 20 * (found[2] - found[1])
@@ -290,7 +290,7 @@ def test_intervals_are_wider_if_a_comparison_was_tested_again():
 
 
 def test_rare_failures_count_with_the_same_seeds_in_all_cells():
-    """More seeds where trainings failed do not show that an agent equals another."""
+    """More seeds where trainings failed show neither that agents are equal nor that they differ."""
     effects = load(EXPERIMENTS / "effects.py")
     level = np.full(40, 0.9) + 0.001 * np.sin(np.arange(40))
     failing = np.where(np.arange(40) == 3, -0.2, level)
@@ -298,15 +298,20 @@ def test_rare_failures_count_with_the_same_seeds_in_all_cells():
     other = [level[:5] for _ in range(16)]
     for kind, good in ((effects.Effect, "no effect"), (effects.Equal, "supported")):
         uneven = kind("", other, cells)
-        assert max(-uneven.interval(0.9)[1], uneven.interval(0.9)[2]) < uneven.margin
-        assert uneven.verdict() == "undecided" and "same seeds" in uneven.text()
-        assert uneven.bound() == uneven.even().bound() > uneven.margin
+        assert uneven.verdict() == "undecided" and "trainings failed" in uneven.text()
+        confidence = 1 - 0.1 / uneven.looks()
+        alone, even = (e._single_interval(confidence) for e in (uneven, uneven.even()))
+        assert max(np.abs(alone)) < uneven.margin < uneven.bound() == max(np.abs(even))
         assert uneven.even().seeds() == (5, 5)
-        # Failures of two cells with equal numbers of seeds, and none at all, change nothing.
+        # A failure that only later seeds have counts, too.
+        late = kind("", other, [failing[::-1], *cells[1:]])
+        assert late.interval()[1:] == late._single_interval(1 - 0.05 / late.looks())[1:]
         assert kind("", other, [level, *cells[1:]]).verdict() == good
         assert not kind("", failing, level[:5]).has_failures()
-    rover = effects.Effect("", other, cells, failed=-np.inf)
-    assert not rover.has_failures()
+    better = effects.Effect("", other, [cell - 0.02 for cell in cells])
+    assert better._single_interval(0.99)[1] > 0 and better.verdict() == "undecided"
+    assert not effects.Effect("", other, cells, failed=-np.inf).has_failures()
+    assert not effects.Effect("", other, [np.full(40, -0.2), *other[1:]]).has_failures()
 
 
 def test_comparisons_have_a_part_for_each_length():

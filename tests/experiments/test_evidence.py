@@ -308,14 +308,15 @@ def test_the_sixth_agent_has_a_setting_of_its_own_and_twice_the_steps():
     assert "--replay-capacity=20000" in module.current_setting("h-td3")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name, of_a_lane", [("pendulum", 1), ("generalisation", 5)])
 def test_the_pendulums_tables_state_what_their_files_hold(name, of_a_lane):
     """Tables, pictures and claims are of the same trainings."""
-    lanes = json.loads((EXPERIMENTS / "results" / f"{name}.json").read_text())["lanes"]
-    assert lanes * of_a_lane == len(pd.read_parquet(EXPERIMENTS / "results" / f"{name}.parquet"))
+    facts = json.loads((EXPERIMENTS / "results" / f"{name}.json").read_text())
+    rows = len(pd.read_parquet(EXPERIMENTS / "results" / f"{name}.parquet"))
+    assert facts["lanes"] * of_a_lane == rows and facts["width"] == "128"
 
 
+@pytest.mark.slow
 def test_pairs_of_precisions_are_compared(tmp_path):
     pairs = load(EXPERIMENTS / "bfloat16_returns.py")
     options = ["--quick", "--run", str(tmp_path / "run"), "--out", str(tmp_path)]

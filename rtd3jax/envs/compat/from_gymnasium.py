@@ -1,5 +1,6 @@
 """`from_gymnasium`: wraps any Gymnasium environment for the trainer."""
 
+import dataclasses
 import hashlib
 import math
 import pathlib
@@ -104,11 +105,16 @@ def _registered(example: gymnasium.Env) -> Iterator[object]:
 def _opaque(value: object) -> Iterator[object]:
     """All parts of ``value`` that are neither plain data nor arrays, such as functions.
 
-    An instance of a subclass of a plain type is not plain data, because its methods are code.
+    The parts of a dataclass are its class and the values of its fields. An instance of a subclass
+    of a plain type is not plain data, because its methods are code.
     """
     if isinstance(value, Iterable) and type(value) in (list, tuple, set, frozenset, dict):
         for part in value.items() if isinstance(value, dict) else value:
             yield from _opaque(part)
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        yield type(value)
+        for field in dataclasses.fields(value):
+            yield from _opaque(getattr(value, field.name))
     elif isinstance(value, np.ndarray):
         yield from [value] if value.dtype.hasobject else []
     elif type(value) not in _PLAIN and not isinstance(value, _DATA):

@@ -11,7 +11,7 @@ from rtd3jax.envs.registry import register
 from rtd3jax.envs.rover.controllers import constant_command, target_pi
 from rtd3jax.envs.rover.environment import Rover, RoverParams, RoverState
 from rtd3jax.envs.rover.optimum import best_return
-from rtd3jax.envs.rover.slip import Ar1Slip, ConstantSlip, SineSlip
+from rtd3jax.envs.rover.slip import WHEELS, Ar1Slip, ConstantSlip, SineSlip
 from rtd3jax.envs.stress import Stress
 from rtd3jax.protocols import EnvironmentLike
 
@@ -27,16 +27,17 @@ def feedforward_pi(env: EnvironmentLike) -> PIDPolicy | None:
 
 
 def next_slip(state: RoverState) -> jax.Array | None:
-    """The slip [..., 2] that acts in the next step; None if no state has a field ``slip``.
+    """The slip [..., 2] that acts in the next step; None if the state does not state it.
 
-    Several slips act in sequence, so their tractions, one minus the slip, are multiplied. The
-    result is None if one of them only acts on one wheel, because its state does not state which.
+    Joined slips act in sequence, so their tractions, one minus the slip, are multiplied. The result
+    is None if one of them has no field ``slip``, or acts on one wheel, since it does not state on
+    which. The state of a `Sum`, which no name makes, looks like that of joined slips.
     """
-    parts = state.slip if type(state.slip) is tuple else (state.slip,)
-    slips = [part.slip for part in parts if hasattr(part, "slip")]
-    if len(slips) < 2:
-        return slips[0] if slips else None
-    if any(slip.shape != slips[0].shape for slip in slips):
+    if type(state.slip) is not tuple:
+        return getattr(state.slip, "slip", None)
+    slips = [part.slip for part in state.slip if hasattr(part, "slip")]
+    whole = len(slips) == len(state.slip) and all(slip.shape[-1] == WHEELS for slip in slips)
+    if not slips or not whole:
         return None
     return 1.0 - functools.reduce(operator.mul, [1.0 - slip for slip in slips])
 

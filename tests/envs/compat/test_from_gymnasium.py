@@ -517,6 +517,29 @@ def test_an_edited_function_is_another_environment(monkeypatch, given):
     close_simulators()
 
 
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Data of an environment, and a function."""
+
+    reward: float
+    shaping: object
+
+
+def test_equal_options_are_the_same_environment(monkeypatch):
+    def make(options):
+        return Shaped(options.shaping)
+
+    def environment_with(reward):
+        options = Options(reward, shaping)
+        return rtd.from_gymnasium(make, max_steps_in_episode=3, options=options)
+
+    first, equal, other = map(environment_with, (1.0, 1.0, 2.0))
+    assert first == equal and first.fleet is equal.fleet and first != other
+    monkeypatch.setattr(sys.modules[__name__], "shaping", another(1.0))
+    assert environment_with(1.0) not in (first, other)
+    close_simulators()
+
+
 class Changed(Cart):
     """The class after it was edited."""
 
@@ -561,13 +584,13 @@ def test_more_episodes_than_simulators_are_played_in_parts(monkeypatch):
     begun = Cart.begun
     whole, once = play(), Cart.begun - begun
     assert fleet.count == 3
-    monkeypatch.setattr(simulator, "MOST", 2)
+    monkeypatch.setattr(simulator, "MOST", 4)  # two for an evaluation, two for lanes beside it
     before, begun = Cart.made, Cart.begun
     for one, other in zip(whole, play(), strict=True):
         np.testing.assert_array_equal(one, other)
     assert fleet.count == Cart.made - before == 2
     assert Cart.begun - begun <= once  # no episode is replayed
-    keys = jax.random.split(jax.random.key(0), 3)
-    with pytest.raises(rtd.UserError, match="play at most 2 episodes together, not 3: lower"):
+    keys = jax.random.split(jax.random.key(0), 5)
+    with pytest.raises(rtd.UserError, match="play at most 4 episodes together, not 5: lower"):
         jax.vmap(env.reset, (0, None))(keys, env.default_params)
     close_simulators()

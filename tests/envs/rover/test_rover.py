@@ -182,4 +182,6 @@ def test_the_hidden_slip_of_one_process_is_its_own():
     assert next_slip(state) is state.slip.slip
     joined = state.replace(slip=(state.slip, Ar1SlipState(jnp.ones(1))))
     assert next_slip(joined) is None  # a slip of one wheel, but it is not known of which
+    one_wheel = Ar1SlipState(jnp.ones(1))
+    assert next_slip(state.replace(slip=(one_wheel, one_wheel))) is None
     assert next_slip(state.replace(slip=())) is None
