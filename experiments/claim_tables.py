@@ -9,13 +9,11 @@ import numpy as np
 import pandas as pd
 from effects import FEWEST_SEEDS, Effect
 from pendulum_cells import current_setting
-from settings import setting_text
+from settings import ROVER_SETTING
 
 from rtd3jax.study import presets
 
 CELL = ["algorithm", "disturbance", "history_length"]
-ROVER_SETTING = setting_text({**presets.ROVER_SETTINGS, "total_steps": presets.ROVER_STEPS})
-"""The setting of the rover's trainings; the table may have rows of earlier settings."""
 LONGER = "pendulum_longer/pendulum"
 """The table of trainings with twice the steps (`pendulum.py --steps 60000`)."""
 

@@ -39,7 +39,7 @@ from continuing import (  # noqa: E402
 )
 from rover import EPISODES, SEEDS, TINY, ceiling_returns, levels  # noqa: E402
 from rover import PAPER as PAPER_RETURNS  # noqa: E402
-from settings import setting_text  # noqa: E402
+from settings import ROVER_SETTING  # noqa: E402
 from writing import (  # noqa: E402
     RESULTS,
     check_steps,
@@ -106,9 +106,8 @@ def of_the_rover(results: pathlib.Path) -> pd.DataFrame:
     if not path.exists():
         return pd.DataFrame(columns=COLUMNS)
     rows = pd.read_parquet(path)
-    setting = setting_text({**ROVER_SETTINGS, "total_steps": ROVER_STEPS})
     rows = rows[rows["trained_on"].isin(SLIPS) & (rows["tested_on"] == TESTED_ON)]
-    rows = rows[rows["setting"] == setting]
+    rows = rows[rows["setting"] == ROVER_SETTING]
     windows = np.where(rows["algorithm"] == "td3", 0, ROVER_HISTORY_LENGTH)
     return rows.assign(history_length=windows, steps=ROVER_STEPS)[COLUMNS]
 

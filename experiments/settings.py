@@ -2,6 +2,8 @@
 
 from collections.abc import Iterable
 
+from rtd3jax.study import presets
+
 
 def flags(settings: dict[str, object]) -> list[str]:
     """Fields of the configuration as flags of the sweep."""
@@ -11,6 +13,10 @@ def flags(settings: dict[str, object]) -> list[str]:
 def setting_text(settings: dict[str, object]) -> str:
     """The text of settings in a table, which distinguishes rows of earlier settings."""
     return " ".join(flags(settings))
+
+
+ROVER_SETTING = setting_text({**presets.ROVER_SETTINGS, "total_steps": presets.ROVER_STEPS})
+"""The current setting of experiments/rover.py, whose table may have rows of earlier settings."""
 
 
 def mark(older: int, count: int) -> str:
