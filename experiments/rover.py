@@ -28,7 +28,7 @@ from matplotlib.figure import Figure
 
 import rtd3jax as rtd
 from rtd3jax.protocols import EnvironmentLike, PolicyLike
-from rtd3jax.study.plan import make_cells
+from rtd3jax.study.cells import make_cells
 from rtd3jax.study.presets import PRESETS
 from rtd3jax.study.presets import ROVER_HISTORY_LENGTH as HISTORY_LENGTH
 from rtd3jax.study.presets import ROVER_SETTINGS as SETTINGS

@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 
 import rtd3jax as rtd
-from rtd3jax.study.plan import Grid, make_cells
+from rtd3jax.study.cells import Grid, make_cells
 from rtd3jax.study.presets import ROVER_HISTORY_LENGTH, ROVER_SETTINGS, ROVER_STEPS
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))

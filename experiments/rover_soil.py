@@ -24,7 +24,7 @@ import pandas as pd
 
 import rtd3jax as rtd
 from rtd3jax.envs.rover_soil.controllers import adaptive_slip, feedforward_pi
-from rtd3jax.study.plan import Grid, make_cells
+from rtd3jax.study.cells import Grid, make_cells
 from rtd3jax.study.presets import ROVER_HISTORY_LENGTH as HISTORY_LENGTH
 from rtd3jax.study.presets import ROVER_SETTINGS as SETTINGS
 from rtd3jax.study.presets import ROVER_STEPS as STEPS

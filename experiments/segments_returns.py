@@ -34,7 +34,7 @@ from pendulum import scale  # noqa: E402
 from writing import RESULTS, markdown_table, parse, provenance, write_results  # noqa: E402
 
 from experiments.benchmarks.ours import Lanes, make_config  # noqa: E402
-from rtd3jax.training.lanes import workers  # noqa: E402
+from rtd3jax.training.devices import workers  # noqa: E402
 
 AGENT, WIDTH, EPISODES = "lstm-td3-1ha1hc", 64, 1_000
 PAPERS_BEST = 1.36

@@ -13,8 +13,8 @@ import sys
 
 import pandas as pd
 
+from rtd3jax.study.cells import Grid, cell_jobs, make_cells
 from rtd3jax.study.memory_plan import job_bytes, lanes_at_once
-from rtd3jax.study.plan import Grid, cell_jobs, make_cells
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from writing import RESULTS, markdown_table, parse, provenance, write_results  # noqa: E402

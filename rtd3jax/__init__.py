@@ -39,9 +39,10 @@ from rtd3jax.policies.baselines import constant_policy, random_policy
 from rtd3jax.policies.export.stablehlo_file import load_stablehlo
 from rtd3jax.policies.load import load_policy
 from rtd3jax.policies.trained import Policy
-from rtd3jax.study.plan import Cell
+from rtd3jax.study.cells import Cell
 from rtd3jax.system.versions import versions_of
-from rtd3jax.training.run import Failure, Run, train
+from rtd3jax.training.result import Failure, Run
+from rtd3jax.training.train import train
 
 __all__ = [
     "ALGORITHMS",

@@ -110,13 +110,13 @@ def test_the_checks_can_fail():
         "rtd3jax.study": "",
         "rtd3jax.study.hosts": "from rtd3jax.study import launch",
         "rtd3jax.study.launch": "def main():\n    from rtd3jax import sweep",
-        "rtd3jax.envs.rover": "import rtd3jax.training.run\nfrom rtd3jax import Config",
-        "rtd3jax.training.run": "",
+        "rtd3jax.envs.rover": "import rtd3jax.training.train\nfrom rtd3jax import Config",
+        "rtd3jax.training.train": "",
     }
     graph = graph_of(planted)
     assert upward("rtd3jax.study.launch", graph["rtd3jax.study.launch"]) == ["rtd3jax.sweep"]
     wrong = upward("rtd3jax.envs.rover", graph["rtd3jax.envs.rover"])
-    assert wrong == ["rtd3jax", "rtd3jax.training.run"]
+    assert wrong == ["rtd3jax", "rtd3jax.training.train"]
     assert circle(graph) == ["rtd3jax.study.hosts", "rtd3jax.study.launch", "rtd3jax.sweep"]
 
 

@@ -15,10 +15,10 @@ from rtd3jax import sweep
 from rtd3jax.config import Config
 from rtd3jax.errors import UserError
 from rtd3jax.study import cluster, hosts
+from rtd3jax.study.cells import Cell, Grid, cell_jobs, make_cells
 from rtd3jax.study.execute import Work
 from rtd3jax.study.log import LOG
 from rtd3jax.study.log_reader import LogReader
-from rtd3jax.study.plan import Cell, Grid, cell_jobs, make_cells
 from rtd3jax.study.rundir import RunDirectory
 
 STUDY = [

@@ -10,7 +10,7 @@ from random_policies import random_policy
 import rtd3jax as rtd
 from rtd3jax.envs import registry
 from rtd3jax.export import main
-from rtd3jax.study.plan import Cell
+from rtd3jax.study.cells import Cell
 from rtd3jax.study.rundir import RunDirectory
 
 CONFIG = rtd.Config(algorithm="h-td3", history_length=3, hidden_size=8, total_steps=100)

@@ -18,13 +18,13 @@ import pytest
 from rtd3jax import sweep
 from rtd3jax.errors import UserError
 from rtd3jax.study import process_plan, processes
+from rtd3jax.study.cells import Grid, cell_jobs, make_cells
 from rtd3jax.study.crew import Crew
 from rtd3jax.study.lock import is_held
 from rtd3jax.study.log import LOG, read_log
-from rtd3jax.study.plan import Grid, cell_jobs, make_cells
 from rtd3jax.study.report import data
 from rtd3jax.study.rundir import RunDirectory
-from rtd3jax.training.lanes import make_groups
+from rtd3jax.training.grouping import make_groups
 
 STEPS, SEEDS = 4_000, 3
 STUDY = [

@@ -16,7 +16,7 @@ from rtd3jax.config import Config
 from rtd3jax.envs import registry
 from rtd3jax.errors import UserError
 from rtd3jax.study import finish, interim, presets, recorder, references, time_estimate
-from rtd3jax.study.plan import Cell, Grid, bar_labels, make_cells
+from rtd3jax.study.cells import Cell, Grid, bar_labels, make_cells
 from rtd3jax.study.presets import PRESETS
 from rtd3jax.study.results import CURVES, EPISODES, read_table
 from rtd3jax.training import lanes

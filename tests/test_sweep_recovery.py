@@ -19,6 +19,7 @@ from rtd3jax.study.derive import derive
 from rtd3jax.study.log import LOG, append_rows, lane_of, read_log
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.training import lanes
+from rtd3jax.training.devices import workers
 
 STUDY = [
     *("--env", "rover", "--disturbances", "ar1-slip", "--algorithms", "td3", "h-td3"),
@@ -157,7 +158,7 @@ def test_sigterm_leaves_checkpoints_and_the_rest_is_the_same(whole, tmp_path, mo
         if group.step >= 40:
             os.kill(os.getpid(), signal.SIGTERM)
 
-    two = (lanes.workers() * 2)[:2]  # so that some of the four lanes have not begun
+    two = (workers() * 2)[:2]  # so that some of the four lanes have not begun
     with one_step_chunks(monkeypatch) as patch:
         patch.setattr(recorder.Recorder, "update", update)
         patch.setattr(execute, "workers", lambda: two)
@@ -195,7 +196,7 @@ def test_one_worker_finishes_what_two_began(whole, tmp_path, monkeypatch):
     with one_step_chunks(monkeypatch) as patch:
         patch.setattr(recorder.Recorder, "update", interrupt)
         assert run(out) == 130
-    one = lanes.workers()[:1]
+    one = workers()[:1]
     monkeypatch.setattr(lanes, "workers", lambda: one)
     assert run(out) == 0
     assert contents(out) == contents(whole)

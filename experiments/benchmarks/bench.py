@@ -42,7 +42,7 @@ from experiments.writing import parse
 from rtd3jax.envs.interface import foreign_code
 from rtd3jax.errors import UserError
 from rtd3jax.system.files import write_bytes_atomically
-from rtd3jax.training.lanes import workers
+from rtd3jax.training.devices import workers
 
 LENGTHS = (1, 3, 6, 10, 20)
 SEEDS = 5

@@ -22,7 +22,7 @@ from experiments.benchmarks import products, profile, report
 from experiments.benchmarks.bench import LENGTHS, QUICK, Measurements, Sizes, machine
 from experiments.benchmarks.ours import Lanes, make_config
 from rtd3jax.errors import UserError
-from rtd3jax.training.lanes import workers
+from rtd3jax.training.devices import workers
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
 from writing import BENCHMARKS, markdown_table, parse  # noqa: E402

@@ -12,7 +12,10 @@ import numpy as np
 
 import rtd3jax as rtd
 from rtd3jax.training import executables, lanes
-from rtd3jax.training.run import make_jobs
+from rtd3jax.training.devices import workers
+from rtd3jax.training.grouping import make_groups
+from rtd3jax.training.groups import Group
+from rtd3jax.training.jobs import make_jobs
 
 # A measurement ends after the running chunks, and begins with chunks of unknown speed: both must be
 # short compared with the measurement. The overhead of short chunks is included in the result.
@@ -47,7 +50,7 @@ class Lanes:
             make_jobs(env, configs[seed % len(configs)], [seed], window=window)[0]
             for seed in range(seeds)
         ]
-        groups = lanes.make_groups(jobs, strategy, devices or len(lanes.workers()))
+        groups = make_groups(jobs, strategy, devices or len(workers()))
         self.groups = [_Clocked(group.jobs) for group in groups]
 
     def compile(self) -> float:
@@ -118,7 +121,7 @@ class Lanes:
     def _until(self, enough: Any) -> None:
         """Advance all groups until ``enough()`` is true after a chunk; wait for running chunks."""
 
-        def on_chunk(group: lanes.Group) -> None:
+        def on_chunk(group: Group) -> None:
             if group.error is not None:
                 raise group.error
             if group.lost:
@@ -130,7 +133,7 @@ class Lanes:
             lanes.advance_groups(self.groups, on_chunk)
 
 
-class _Clocked(lanes.Group):
+class _Clocked(Group):
     """A group that records when each worker last advanced it."""
 
     ends: dict[int, float] = {}
@@ -161,7 +164,7 @@ def sgemm(size: int, seconds: float) -> tuple[float, float]:
     options = {"xla_cpu_multi_thread_eigen": False}
     product = jax.jit(jnp.matmul, compiler_options=options).lower(a, a).compile()
     jax.block_until_ready(product(a, a))
-    done = [0] * len(lanes.workers())
+    done = [0] * len(workers())
     began = time.perf_counter()
 
     def work(worker: int) -> None:

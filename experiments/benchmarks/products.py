@@ -24,8 +24,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.benchmarks.ours import Lanes, make_config
-from rtd3jax.study.plan import update_flops
-from rtd3jax.training.lanes import workers
+from rtd3jax.study.flops import update_flops
+from rtd3jax.training.devices import workers
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
 from writing import BENCHMARKS, markdown_table, parse  # noqa: E402

@@ -21,7 +21,7 @@ import jax
 
 from experiments.benchmarks.ours import Lanes, make_config
 from rtd3jax.agents.variants import ALGORITHMS
-from rtd3jax.training.lanes import workers
+from rtd3jax.training.devices import workers
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
 from writing import BENCHMARKS, markdown_table, parse  # noqa: E402

@@ -15,7 +15,7 @@ from experiments.benchmarks.ours import make_config
 from experiments.benchmarks.torch_processes import ONE_PROCESS, PROCESS_PER_CORE
 from rtd3jax.agents.variants import ALGORITHMS
 from rtd3jax.study.colours import colour_of
-from rtd3jax.study.plan import update_flops
+from rtd3jax.study.flops import update_flops
 from rtd3jax.system.files import write_bytes_atomically
 
 COLUMNS = ["agent", "history_length", "measurement", "repeat", "value", "machine"]

@@ -24,7 +24,7 @@ import rtd3jax as rtd
 from experiments.benchmarks.bench import machine
 from experiments.benchmarks.ours import Lanes, make_config
 from experiments.benchmarks.torch_processes import PROCESS_PER_CORE, TorchProcesses
-from rtd3jax.training.lanes import workers
+from rtd3jax.training.devices import workers
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
 from writing import BENCHMARKS, markdown_table, parse, provenance, write_results  # noqa: E402

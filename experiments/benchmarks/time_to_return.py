@@ -22,7 +22,7 @@ import pandas as pd  # noqa: E402
 
 import rtd3jax as rtd  # noqa: E402
 from experiments.benchmarks.bench import machine  # noqa: E402
-from rtd3jax.study.plan import make_cells  # noqa: E402
+from rtd3jax.study.cells import make_cells  # noqa: E402
 from rtd3jax.study.presets import PRESETS  # noqa: E402
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))

@@ -18,7 +18,7 @@ import jax
 
 import rtd3jax as rtd
 from rtd3jax.training.checkpoint import _PATIENCE, DEFAULT_SECONDS, Checkpoints
-from rtd3jax.training.run import make_jobs
+from rtd3jax.training.jobs import make_jobs
 
 LANES, CORES = 5, 2
 

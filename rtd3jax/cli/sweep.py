@@ -19,13 +19,14 @@ import jax
 from rtd3jax.cli import sweep_options
 from rtd3jax.cli.common import exit_status
 from rtd3jax.errors import UserError
+from rtd3jax.study.cells import make_cells
 from rtd3jax.study.cluster import check_absolute_starts, train_on_cluster
 from rtd3jax.study.execute import Work, train_here, waiting_jobs
 from rtd3jax.study.hosts import own_shard, own_share, relaunch
 from rtd3jax.study.lock import parse_shard, writer
 from rtd3jax.study.loggers import check_loggers
 from rtd3jax.study.memory_plan import lanes_at_once, usable_memory
-from rtd3jax.study.plan import make_cells, plan_text
+from rtd3jax.study.plan import plan_text
 from rtd3jax.study.process_plan import Shares, shares_of
 from rtd3jax.study.processes import train_in_processes
 from rtd3jax.study.run import Trainer, run_study
@@ -34,8 +35,9 @@ from rtd3jax.study.starts import check_starts_stay, planned_jobs
 from rtd3jax.study.status import ledger
 from rtd3jax.system.imports import import_modules
 from rtd3jax.system.interrupts import Terminated, terminable
-from rtd3jax.training.lanes import Job, workers
-from rtd3jax.training.run import check_strategy
+from rtd3jax.training.arguments import check_strategy
+from rtd3jax.training.devices import workers
+from rtd3jax.training.jobs import Job
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

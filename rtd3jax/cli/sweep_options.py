@@ -15,8 +15,8 @@ from rtd3jax.config import Config
 from rtd3jax.envs.builtin import LISTED
 from rtd3jax.errors import UserError
 from rtd3jax.registries import AGENTS
+from rtd3jax.study.cells import Grid
 from rtd3jax.study.loggers import LOGGERS
-from rtd3jax.study.plan import Grid
 from rtd3jax.study.presets import PRESETS
 
 _GRID_FIELDS = ("algorithm", "history_length")

@@ -9,7 +9,7 @@ from rtd3jax.policies.trained import Policy
 from rtd3jax.system.files import user_path
 
 if TYPE_CHECKING:
-    from rtd3jax.study.plan import Cell
+    from rtd3jax.study.cells import Cell
     from rtd3jax.study.rundir import RunDirectory
 
 

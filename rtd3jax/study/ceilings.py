@@ -10,7 +10,7 @@ from typing import Any
 from rtd3jax.envs.disturbed import with_true_reward
 from rtd3jax.errors import UserError, short_reason
 from rtd3jax.evaluation.ceiling import ceiling
-from rtd3jax.study.plan import Cell
+from rtd3jax.study.cells import Cell
 from rtd3jax.study.results import rounded_number
 from rtd3jax.system.files import write_bytes_atomically
 from rtd3jax.system.versions import versions_of

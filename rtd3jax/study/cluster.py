@@ -25,6 +25,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from rtd3jax.errors import UserError, short_reason
+from rtd3jax.study.cells import Cell
 from rtd3jax.study.derive import Reference
 from rtd3jax.study.execute import Work, forget_errors, train_here, waiting_jobs
 from rtd3jax.study.interim import InterimResults
@@ -33,14 +34,14 @@ from rtd3jax.study.log import TASKS
 from rtd3jax.study.log_reader import LogReader
 from rtd3jax.study.loggers import Logger
 from rtd3jax.study.memory_plan import WORKER_BYTES, job_bytes, lanes_at_once, usable_memory
-from rtd3jax.study.plan import Cell
 from rtd3jax.study.rundir import PACKAGES, RunDirectory
 from rtd3jax.system.files import user_path
 from rtd3jax.system.imports import import_modules
 from rtd3jax.system.interrupts import patient
 from rtd3jax.system.versions import versions_of
-from rtd3jax.training.checkpoint import checkpoint_steps
-from rtd3jax.training.lanes import Job, workers
+from rtd3jax.training.checkpoint_files import checkpoint_steps
+from rtd3jax.training.devices import workers
+from rtd3jax.training.jobs import Job
 
 _POLL_SECONDS = 0.1
 _CONNECT_SECONDS = 10.0

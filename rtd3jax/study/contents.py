@@ -12,10 +12,10 @@ from typing import Any
 
 from rtd3jax.errors import UserError
 from rtd3jax.registries import AGENTS, MEMORIES
-from rtd3jax.study.plan import Cell, cell_jobs
-from rtd3jax.training.checkpoint import LONGER
-from rtd3jax.training.lanes import Job
-from rtd3jax.training.run import check_seeds
+from rtd3jax.study.cells import Cell, cell_jobs
+from rtd3jax.training.arguments import check_seeds
+from rtd3jax.training.jobs import Job
+from rtd3jax.training.lane_identity import LONGER
 
 _NAMED = 3
 """Number of items that a message lists by name."""

@@ -15,7 +15,7 @@ from typing import Any
 from rtd3jax.errors import UserError
 from rtd3jax.study import worker
 from rtd3jax.system.interrupts import patient
-from rtd3jax.training.lanes import Group
+from rtd3jax.training.groups import Group
 
 _ENDING = (
     "the processes end their current steps and write checkpoints; another interrupt ends them "

@@ -6,16 +6,20 @@ from typing import Any
 
 import jax
 
+from rtd3jax.study.cells import bar_labels
 from rtd3jax.study.derive import Reference
 from rtd3jax.study.interim import InterimResults
 from rtd3jax.study.loggers import Logger
 from rtd3jax.study.memory_plan import lanes_in_total
-from rtd3jax.study.plan import bar_labels
 from rtd3jax.study.recorder import Recorder
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.starts import add_starts
 from rtd3jax.training.checkpoint import Checkpoints
-from rtd3jax.training.lanes import Group, Job, advance_groups, make_groups, workers
+from rtd3jax.training.devices import workers
+from rtd3jax.training.grouping import make_groups
+from rtd3jax.training.groups import Group
+from rtd3jax.training.jobs import Job
+from rtd3jax.training.lanes import advance_groups
 from rtd3jax.training.plant import MOST_NUMBERS, named_numbers
 from rtd3jax.training.progress import Progress
 
@@ -25,7 +29,7 @@ class Work:
     """Options of the training of lanes.
 
     Attributes:
-        strategy: ``map`` or ``vmap``; see `rtd3jax.training.lanes`.
+        strategy: ``map`` or ``vmap``; see `rtd3jax.training.groups`.
         at_once: number of lanes that fit in memory; under ``vmap``, in the memory of a device.
         interval: (seconds, steps) between checkpoints of a lane; with (None, None), it is five
             minutes, or longer if a checkpoint takes long.

@@ -17,7 +17,7 @@ import jax
 
 from rtd3jax.errors import UserError
 from rtd3jax.study import launch
-from rtd3jax.training.lanes import Job
+from rtd3jax.training.jobs import Job
 
 
 def relaunch(command: str, arguments: Sequence[str] | None) -> NoReturn:

@@ -17,7 +17,7 @@ from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
 from rtd3jax.policies.serialization import read_interface, restore_policy, under_prefix
 from rtd3jax.policies.trained import FORMAT, Policy
-from rtd3jax.study.plan import Cell
+from rtd3jax.study.cells import Cell
 from rtd3jax.system.files import read_arrays, read_metadata, write_arrays, write_bytes_atomically
 
 

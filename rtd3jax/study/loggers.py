@@ -19,8 +19,8 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Generic, Protocol, TypeVar
 
 from rtd3jax.errors import UserError, short_reason
+from rtd3jax.study.cells import Cell
 from rtd3jax.study.lane_files import cell_name
-from rtd3jax.study.plan import Cell
 from rtd3jax.study.rundir import RunDirectory
 
 METRIC = "evaluation/return"

@@ -11,7 +11,8 @@ from rtd3jax.config import Config
 from rtd3jax.errors import UserError
 from rtd3jax.registries import AGENTS
 from rtd3jax.system.machine import memory_limit
-from rtd3jax.training.lanes import Job, workers
+from rtd3jax.training.devices import workers
+from rtd3jax.training.jobs import Job
 
 _GRADIENTS = 1.3
 """Number of temporary copies of all parameters."""

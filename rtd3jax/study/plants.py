@@ -8,9 +8,9 @@ import jax
 
 from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
-from rtd3jax.study.plan import Cell
+from rtd3jax.study.cells import Cell
 from rtd3jax.study.plant_code import code_of, is_other_code
-from rtd3jax.training.checkpoint import difference, same
+from rtd3jax.training.lane_identity import difference, same
 from rtd3jax.training.plant import plant_of
 
 Plants = dict[str, dict[str, Any]]

@@ -8,7 +8,7 @@ why they help.
 from typing import Any
 
 from rtd3jax.agents.variants import ALGORITHMS
-from rtd3jax.study.plan import Grid
+from rtd3jax.study.cells import Grid
 
 ROVER_STEPS = 80_000
 ROVER_HISTORY_LENGTH = 1

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from rtd3jax.errors import UserError
 from rtd3jax.study.memory_plan import processes_bytes
 from rtd3jax.system.machine import cores, memory_limit
-from rtd3jax.training.lanes import Job, workers
+from rtd3jax.training.devices import workers
+from rtd3jax.training.jobs import Job
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from rtd3jax.errors import UserError
+from rtd3jax.study.cells import bar_labels
 from rtd3jax.study.crew import Crew, Member
 from rtd3jax.study.derive import Reference
 from rtd3jax.study.execute import Work, forget_errors, waiting_jobs
@@ -24,10 +25,11 @@ from rtd3jax.study.interim import InterimResults
 from rtd3jax.study.log import LOG, repair_log
 from rtd3jax.study.log_reader import LogReader
 from rtd3jax.study.loggers import Logger
-from rtd3jax.study.plan import bar_labels
 from rtd3jax.study.process_plan import Shares
 from rtd3jax.study.rundir import RunDirectory
-from rtd3jax.training.lanes import Group, Job, make_groups
+from rtd3jax.training.grouping import make_groups
+from rtd3jax.training.groups import Group
+from rtd3jax.training.jobs import Job
 from rtd3jax.training.progress import Progress
 
 _POLL_SECONDS = 0.3

@@ -12,9 +12,10 @@ from rtd3jax.study.log import LOG, append_rows, repair_log
 from rtd3jax.study.loggers import Logger
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.training.checkpoint import Checkpoints
-from rtd3jax.training.lanes import Group, Job
+from rtd3jax.training.groups import Group
+from rtd3jax.training.jobs import Job
 from rtd3jax.training.loop import HEALTHY, LaneState
-from rtd3jax.training.run import curves_of, evaluation_steps, failure_of, metric_curves
+from rtd3jax.training.result import curves_of, evaluation_steps, failure_of, metric_curves
 
 
 class Recorder:

@@ -11,8 +11,8 @@ from rtd3jax.errors import UserError, short_reason
 from rtd3jax.evaluation.returns import both_returns
 from rtd3jax.policies.baselines import constant_policy, random_policy
 from rtd3jax.registries import AGENTS
+from rtd3jax.study.cells import Cell
 from rtd3jax.study.derive import Reference
-from rtd3jax.study.plan import Cell
 
 EPISODES = 1_000
 SIMULATED_EPISODES = 100

@@ -11,9 +11,9 @@ import pandas as pd
 from rtd3jax.errors import UserError
 from rtd3jax.evaluation.robustness import MEASURED, Case, check_policy, make_cases, rows_of
 from rtd3jax.evaluation.robustness_plot import plot_robustness
+from rtd3jax.study.cells import Cell
 from rtd3jax.study.colours import ordered
 from rtd3jax.study.lane_files import file_name
-from rtd3jax.study.plan import Cell
 from rtd3jax.study.plants import CheckedEnvironments
 from rtd3jax.study.results import CELL, LANE
 from rtd3jax.study.rundir import RunDirectory

@@ -9,7 +9,7 @@ from rtd3jax.study.lock import writer
 from rtd3jax.study.loggers import open_loggers
 from rtd3jax.study.references import references_of
 from rtd3jax.study.rundir import RunDirectory
-from rtd3jax.training.lanes import Job
+from rtd3jax.training.jobs import Job
 
 Trainer = Callable[..., None]
 """`train_here`, or another function with the same arguments."""

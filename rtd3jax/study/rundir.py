@@ -17,6 +17,7 @@ import numpy as np
 
 from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
+from rtd3jax.study.cells import Cell
 from rtd3jax.study.contents import (
     Contents,
     additions_text,
@@ -26,15 +27,15 @@ from rtd3jax.study.contents import (
 )
 from rtd3jax.study.lane_files import LaneFiles, cell_name, check_names
 from rtd3jax.study.lock import writer
-from rtd3jax.study.plan import Cell
 from rtd3jax.study.plants import Plants, check_plants, plant_name, plants_of
 from rtd3jax.system.files import (
     user_path,
     write_bytes_atomically,
 )
 from rtd3jax.system.versions import versions_of
-from rtd3jax.training.checkpoint import checkpoint_steps, why_not_longer
-from rtd3jax.training.lanes import Job
+from rtd3jax.training.checkpoint_files import checkpoint_steps
+from rtd3jax.training.jobs import Job
+from rtd3jax.training.lane_identity import why_not_longer
 
 CONFIG = "config.json"
 CONFIG_FORMAT = 2

@@ -4,12 +4,13 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from rtd3jax.errors import UserError
-from rtd3jax.study.plan import Cell
+from rtd3jax.study.cells import Cell
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.system.files import user_path
-from rtd3jax.training.checkpoint import checkpoint_files, checkpoint_steps
-from rtd3jax.training.lanes import Job
-from rtd3jax.training.start import Start, starts_of_path
+from rtd3jax.training.checkpoint_files import checkpoint_files, checkpoint_steps
+from rtd3jax.training.jobs import Job
+from rtd3jax.training.start import Start
+from rtd3jax.training.starts import starts_of_path
 
 
 def planned_jobs(directory: RunDirectory, strategy: str, *, fresh: bool = False) -> list[Job]:

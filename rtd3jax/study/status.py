@@ -3,13 +3,13 @@
 from typing import Any
 
 from rtd3jax.errors import UserError
+from rtd3jax.study.cells import Cell
 from rtd3jax.study.lane_files import LaneFiles
 from rtd3jax.study.lock import is_held
 from rtd3jax.study.log import LOG, lane_of, read_log, steps_reached
-from rtd3jax.study.plan import Cell
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.system.files import read_arrays
-from rtd3jax.training.checkpoint import checkpoint_steps
+from rtd3jax.training.checkpoint_files import checkpoint_steps
 
 
 def ledger(directory: RunDirectory) -> list[dict[str, Any]]:

@@ -18,11 +18,11 @@ import pandas as pd
 from rtd3jax.errors import UserError
 from rtd3jax.policies.trained import Policy
 from rtd3jax.study.ceilings import ceilings_of
+from rtd3jax.study.cells import Cell
 from rtd3jax.study.execute import Work
 from rtd3jax.study.figures import final_returns, learning_curves
 from rtd3jax.study.loggers import check_loggers
 from rtd3jax.study.memory_plan import lanes_at_once, usable_memory
-from rtd3jax.study.plan import Cell
 from rtd3jax.study.report.page import write_page
 from rtd3jax.study.run import run_study
 from rtd3jax.study.rundir import RunDirectory, holds_study
@@ -32,8 +32,8 @@ from rtd3jax.study.tables import current_tables
 from rtd3jax.system.files import user_path
 from rtd3jax.system.interrupts import terminable
 from rtd3jax.system.numbers import check_counts
-from rtd3jax.training.lanes import workers
-from rtd3jax.training.run import check_checkpoints, check_seeds, check_strategy
+from rtd3jax.training.arguments import check_checkpoints, check_seeds, check_strategy
+from rtd3jax.training.devices import workers
 
 
 class Study:

@@ -8,8 +8,8 @@ from typing import Any
 import pandas as pd
 
 from rtd3jax.errors import UserError
+from rtd3jax.study.cells import Cell
 from rtd3jax.study.lane_files import LaneFiles
-from rtd3jax.study.plan import Cell
 from rtd3jax.study.results import CELL, CURVES, EPISODES, METRICS, frame, read_table
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.system.files import read_arrays

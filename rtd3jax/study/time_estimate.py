@@ -17,8 +17,11 @@ from rtd3jax.config import Config
 from rtd3jax.study.memory_plan import lanes_in_total
 from rtd3jax.system.interrupts import patient
 from rtd3jax.system.jax_settings import jax_settings, with_settings
+from rtd3jax.training.devices import workers
 from rtd3jax.training.executables import compiled
-from rtd3jax.training.lanes import Executable, Job, advances_alone, stacked, workers
+from rtd3jax.training.grouping import advances_alone
+from rtd3jax.training.jobs import Executable, Job
+from rtd3jax.training.lanes import stacked
 
 MOST_PROGRAMS = 4
 """Maximum number of programs that are timed, because each must be compiled."""

@@ -9,7 +9,7 @@ import pandas as pd
 
 from rtd3jax.errors import UserError
 from rtd3jax.evaluation.returns import both_returns
-from rtd3jax.study.plan import Cell
+from rtd3jax.study.cells import Cell
 from rtd3jax.study.plants import CheckedEnvironments
 from rtd3jax.study.results import LANE
 from rtd3jax.study.rundir import RunDirectory

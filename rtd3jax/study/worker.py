@@ -58,11 +58,12 @@ def _work(answer: Answer) -> int:
 
 
 def _serve(settings: dict[str, Any], orders_from: IO[str], answer: Answer) -> None:
+    from rtd3jax.study.cells import cell_jobs
     from rtd3jax.study.execute import Work, train_here
-    from rtd3jax.study.plan import cell_jobs
     from rtd3jax.study.rundir import RunDirectory
     from rtd3jax.system.imports import import_modules
-    from rtd3jax.training.lanes import Group, Job
+    from rtd3jax.training.groups import Group
+    from rtd3jax.training.jobs import Job
 
     import_modules(settings["imports"])
     directory = RunDirectory.open(settings["path"])

@@ -8,7 +8,8 @@ from rich.console import Console
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 
-from rtd3jax.training.lanes import Group, Job
+from rtd3jax.training.groups import Group
+from rtd3jax.training.jobs import Job
 
 LONG_SECONDS = 60.0
 """Seconds after which the remark is shown."""

@@ -5,7 +5,6 @@ contains the critics, the targets and the optimisers. The replay, the state of t
 the random numbers always belong to the new lane.
 """
 
-import contextlib
 import dataclasses
 import functools
 from collections.abc import Mapping
@@ -19,15 +18,9 @@ import numpy as np
 from rtd3jax.agents.normalise import Normaliser, Statistics
 from rtd3jax.config import Config
 from rtd3jax.errors import UserError
-from rtd3jax.policies.serialization import read_policy
 from rtd3jax.policies.trained import Policy
-from rtd3jax.system.files import read_arrays, user_path
-from rtd3jax.training.checkpoint import (
-    checkpoint_files,
-    identity_there,
-    lane_directory,
-    leaves_from_arrays,
-)
+from rtd3jax.system.files import read_arrays
+from rtd3jax.training.checkpoint_arrays import leaves_from_arrays
 from rtd3jax.training.loop import HEALTHY, Lane, LaneState, Program
 
 KNOWN_OBSERVATIONS = 1_000
@@ -35,6 +28,7 @@ KNOWN_OBSERVATIONS = 1_000
 
 _TAKEN = "learner", "statistics", "true_statistics"
 """The parts of a `LaneState` in a lane's checkpoint from which training continues."""
+
 _FATE = ".failure", ".failed_at"
 
 
@@ -155,71 +149,6 @@ class Start:
             for name in _TAKEN
         }
         return dataclasses.replace(state, **found)
-
-
-IN_MEMORY = "a policy of "
-"""How the name of a start begins that is a policy in memory, and not a path."""
-
-
-def starts_of_path(path: str | Path, seeds: tuple[int, ...]) -> dict[int, Start]:
-    """The start of each seed, from a saved policy or the ``checkpoint_dir`` of a `rtd.train`.
-
-    Raises:
-        UserError: when ``path`` is neither of these, or has no checkpoint of a seed.
-    """
-    if str(path).startswith(IN_MEMORY):
-        raise UserError(
-            f"the configuration is that of a training that started from {path}, which is in no "
-            "file: pass this policy again as start=..., or train with "
-            'dataclasses.replace(config, start="")'
-        )
-    path = user_path(path)
-    if not path.is_dir():
-        policy = read_policy(path)
-        return dict.fromkeys(seeds, Start(str(path), policy))
-    if (path / "config.json").exists():
-        raise UserError(
-            f"{path} is a run directory: give a policy of it, rtd.load_policy({str(path)!r}, ...), "
-            "or use rtd.Study"
-        )
-    found = {}
-    for seed in seeds:
-        files = checkpoint_files(lane_directory(path, seed))
-        if not files:
-            raise UserError(
-                f"{path} is no saved policy, and has no checkpoint of seed {seed} to start from"
-            )
-        found[seed] = Start(_lane_name(path, seed), checkpoint=files[0])
-    return found
-
-
-def starts_if_needed(path: str | Path, directories: Mapping[int, Path]) -> dict[int, Start]:
-    """`starts_of_path` for each seed of ``directories``, which may hold checkpoints of its lane.
-
-    A lane with checkpoints that began from ``path`` does not need it any more: if it cannot be
-    read, the start of this lane only has a name.
-
-    Raises:
-        UserError: as `starts_of_path` does, for any other lane.
-    """
-    with contextlib.suppress(UserError):
-        return starts_of_path(path, tuple(directories))
-    found: dict[int, Start] = {}
-    for seed, directory in directories.items():
-        try:
-            found |= starts_of_path(path, (seed,))
-        except UserError as error:
-            where = identity_there(directory).get("start")
-            # The lane may have begun from something else, which its checkpoints would refuse.
-            if where not in (str(user_path(path)), _lane_name(user_path(path), seed)):
-                raise
-            found[seed] = Start(where, missing=str(error))
-    return found
-
-
-def _lane_name(path: Path, seed: int) -> str:
-    """The name of a start from the lane of ``seed`` in the ``checkpoint_dir`` ``path``."""
-    return f"{path} seed {seed}"
 
 
 def _statistics_of(normaliser: Normaliser) -> Statistics:

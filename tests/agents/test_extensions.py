@@ -14,7 +14,7 @@ import rtd3jax as rtd
 from rtd3jax import report, sweep
 from rtd3jax.agents.learners.base import measured
 from rtd3jax.agents.networks import act, apply_network, init_network
-from rtd3jax.training.run import make_jobs
+from rtd3jax.training.jobs import make_jobs
 
 TINY = dict(
     history_length=2,

@@ -8,7 +8,7 @@ import pytest
 import rtd3jax as rtd
 from rtd3jax.agents.memory import check_memory
 from rtd3jax.registries import MEMORIES
-from rtd3jax.training.run import make_jobs
+from rtd3jax.training.jobs import make_jobs
 
 TOKENS, BATCH, WIDTH = 6, 4, 5
 BUILT_IN = ("lstm", "gru", "min-gru")

@@ -9,8 +9,8 @@ from follow import Follow, Params
 import rtd3jax as rtd
 from rtd3jax.agents.history import flat
 from rtd3jax.agents.normalise import LIMIT, no_statistics
+from rtd3jax.training.jobs import make_jobs
 from rtd3jax.training.loop import make_lane, make_program
-from rtd3jax.training.run import make_jobs
 
 
 def _statistics(rows):

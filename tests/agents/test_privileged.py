@@ -10,7 +10,7 @@ import pytest
 import rtd3jax as rtd
 from rtd3jax.agents.learners.td3 import target
 from rtd3jax.agents.networks import act
-from rtd3jax.training.run import make_jobs
+from rtd3jax.training.jobs import make_jobs
 
 AGENT = "lstm-td3-privileged"
 STEPS = 260  # more than one episode of the pendulum, which has 200 steps

@@ -10,7 +10,7 @@ import pytest
 import rtd3jax as rtd
 from experiments.benchmarks import bench, lanes_on_device, products, report
 from experiments.benchmarks.torch_processes import ONE_PROCESS, PROCESS_PER_CORE, ROOT
-from rtd3jax.study.plan import update_flops
+from rtd3jax.study.flops import update_flops
 from rtd3jax.training import executables
 
 QUICK = ["--quick", "--no-torch", "--out"]

@@ -6,7 +6,7 @@ import pytest
 
 import rtd3jax as rtd
 from rtd3jax.policies.trained import _LONG
-from rtd3jax.training.run import make_jobs
+from rtd3jax.training.jobs import make_jobs
 
 TINY = dict(total_steps=20, learning_starts=10, batch_size=4, hidden_size=4, eval_every=20)
 

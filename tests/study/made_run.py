@@ -3,8 +3,8 @@
 import numpy as np
 from random_policies import random_policy
 
+from rtd3jax.study.cells import make_cells
 from rtd3jax.study.derive import Reference, derive
-from rtd3jax.study.plan import make_cells
 from rtd3jax.study.rundir import RunDirectory
 
 STEPS = [20, 40, 60]

@@ -10,9 +10,9 @@ from random_policies import random_policy
 from scipy import stats
 
 from rtd3jax import compare as command
+from rtd3jax.study.cells import Grid, make_cells
 from rtd3jax.study.comparison import compare_runs
 from rtd3jax.study.derive import derive
-from rtd3jax.study.plan import Grid, make_cells
 from rtd3jax.study.plants import differing_plants
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.statistics import compare

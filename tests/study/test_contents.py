@@ -5,8 +5,8 @@ import json
 import pytest
 
 import rtd3jax as rtd
+from rtd3jax.study.cells import Cell
 from rtd3jax.study.contents import Contents
-from rtd3jax.study.plan import Cell
 
 
 def _config(path, **changes):

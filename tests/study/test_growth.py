@@ -11,10 +11,10 @@ import pytest
 import rtd3jax as rtd
 from rtd3jax import sweep
 from rtd3jax.study import finish, rundir, time_estimate
+from rtd3jax.study.cells import Cell, cell_jobs
 from rtd3jax.study.contents import Contents
 from rtd3jax.study.lane_files import cell_name
 from rtd3jax.study.lock import writer
-from rtd3jax.study.plan import Cell, cell_jobs
 from rtd3jax.study.rundir import RunDirectory
 
 SETTINGS = dict(hidden_size=4, batch_size=4, learning_starts=10, eval_every=30, eval_episodes=1)

@@ -6,10 +6,10 @@ import pytest
 from made_run import make_run
 
 from rtd3jax.study import interim
+from rtd3jax.study.cells import Grid
 from rtd3jax.study.derive import derive
 from rtd3jax.study.interim import InterimResults
 from rtd3jax.study.lock import deriver
-from rtd3jax.study.plan import Grid
 
 
 @pytest.fixture

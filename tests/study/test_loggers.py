@@ -8,8 +8,8 @@ import rtd3jax as rtd
 from rtd3jax.cli import sweep
 from rtd3jax.errors import UserError
 from rtd3jax.study import loggers, run
+from rtd3jax.study.cells import Grid, make_cells
 from rtd3jax.study.loggers import METRIC, check_loggers, open_loggers
-from rtd3jax.study.plan import Grid, make_cells
 from rtd3jax.study.rundir import RunDirectory
 
 LOSS = "learning/critic_loss"

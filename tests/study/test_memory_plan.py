@@ -11,8 +11,9 @@ import pytest
 
 import rtd3jax as rtd
 from rtd3jax.study import memory_plan
-from rtd3jax.training.lanes import advance_groups, make_groups
-from rtd3jax.training.run import make_jobs
+from rtd3jax.training.grouping import make_groups
+from rtd3jax.training.jobs import make_jobs
+from rtd3jax.training.lanes import advance_groups
 
 
 def _jobs(seeds=1, **changes):

@@ -13,7 +13,7 @@ from flax import struct
 from gymnax.environments import environment, spaces
 
 import rtd3jax as rtd
-from rtd3jax.study.plan import Cell
+from rtd3jax.study.cells import Cell
 from rtd3jax.study.plant_code import code_of
 from rtd3jax.study.robustness import run_robustness
 from rtd3jax.study.rundir import RunDirectory

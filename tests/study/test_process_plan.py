@@ -9,10 +9,10 @@ import pytest
 
 from rtd3jax.errors import UserError
 from rtd3jax.study import process_plan, processes
+from rtd3jax.study.cells import Grid, cell_jobs, make_cells
 from rtd3jax.study.memory_plan import processes_bytes
-from rtd3jax.study.plan import Grid, cell_jobs, make_cells
 from rtd3jax.study.rundir import RunDirectory
-from rtd3jax.training.lanes import make_groups
+from rtd3jax.training.grouping import make_groups
 from rtd3jax.training.progress import Progress
 
 

@@ -15,7 +15,7 @@ import rtd3jax as rtd
 from rtd3jax import report, stress, transfer
 from rtd3jax.envs.description import Ceiling
 from rtd3jax.study import ceilings
-from rtd3jax.study.plan import Grid
+from rtd3jax.study.cells import Grid
 from rtd3jax.study.report.page import page_data
 from rtd3jax.study.report.playback import record_episodes
 from rtd3jax.study.rundir import RunDirectory

@@ -13,7 +13,7 @@ import rtd3jax as rtd
 from rtd3jax import stress
 from rtd3jax.envs.description import Ceiling
 from rtd3jax.study import ceilings
-from rtd3jax.study.plan import Grid
+from rtd3jax.study.cells import Grid
 from rtd3jax.study.robustness import over_seeds
 from rtd3jax.study.rundir import RunDirectory
 

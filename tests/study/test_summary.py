@@ -4,6 +4,7 @@ import math
 
 import pandas as pd
 
+from rtd3jax.study.derive import _values_and_owners
 from rtd3jax.study.results import CELL
 from rtd3jax.study.statistics import summarise
 from rtd3jax.study.summary import summary_markdown
@@ -197,3 +198,15 @@ def test_lanes_and_references_with_episodes_without_a_number_say_so():
     listed = text.split("## Lanes without a mean return\n\n")[1]
     assert listed.startswith("- pendulum, none, td3, l = 0, seed 1: 1 of 2 final episodes")
     assert "Lanes without a mean return" not in render(rows("td3", 0, [1.0]))
+
+
+def test_fields_in_which_cells_differ_have_their_owners():
+    def cells(env, algorithms, **fields):
+        return [{"env": env, "algorithm": algorithm, **fields} for algorithm in algorithms]
+
+    agents = ("td3", "h-td3")
+    found = cells("rover", agents, gamma=0.0) + cells("pendulum", agents[:1], gamma=0.9)
+    found += cells("pendulum", agents[1:], gamma=0.99)
+    said = "0.0 (rover); 0.9 (pendulum: td3); 0.99 (pendulum: h-td3)"
+    assert _values_and_owners("gamma", found) == said
+    assert _values_and_owners("gamma", found[2:]) == "0.9 (td3); 0.99 (h-td3)"

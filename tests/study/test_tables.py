@@ -12,9 +12,9 @@ from made_run import STEPS, make_run
 
 import rtd3jax as rtd
 from rtd3jax import stress
+from rtd3jax.study.cells import Grid
 from rtd3jax.study.comparison import compare_runs
 from rtd3jax.study.derive import derive
-from rtd3jax.study.plan import Grid
 from rtd3jax.study.report.page import page_data, write_page
 from rtd3jax.study.results import key_columns
 from rtd3jax.study.rundir import RunDirectory

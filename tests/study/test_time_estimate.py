@@ -12,7 +12,7 @@ import pytest
 
 import rtd3jax as rtd
 from rtd3jax.study import plan, time_estimate
-from rtd3jax.training.run import make_jobs
+from rtd3jax.training.jobs import make_jobs
 
 
 def _jobs(algorithm, seeds=2, **changes):

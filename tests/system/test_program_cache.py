@@ -8,6 +8,7 @@ from gymnax.environments import environment
 import rtd3jax as rtd
 from rtd3jax.system import program_cache as programs
 from rtd3jax.training import executables, lanes
+from rtd3jax.training.devices import workers
 from rtd3jax.training.loop import make_lane, make_program
 
 SETTINGS = {"hidden_size": 4, "batch_size": 4, "learning_starts": 10, "total_steps": 60}
@@ -91,7 +92,7 @@ def test_equal_environments_share_a_program_and_copies_are_warned_of(monkeypatch
     monkeypatch.setattr(executables, "_programs", {})
     monkeypatch.setattr(executables, "_compile", lambda *_: ())
     lane = make_lane(rtd.Config("td3", **SETTINGS), 0, ())
-    device = lanes.workers()[0]
+    device = workers()[0]
 
     def compiled(env, **changes):
         config = rtd.Config("td3", **SETTINGS | changes)

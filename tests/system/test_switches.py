@@ -13,7 +13,7 @@ import pytest
 import rtd3jax as rtd
 from rtd3jax.envs.interface import foreign_code
 from rtd3jax.training import executables
-from rtd3jax.training.run import make_jobs
+from rtd3jax.training.jobs import make_jobs
 
 WORKING = [
     *("JAX_DEBUG_NANS=1", "JAX_DEBUG_INFS=1", "JAX_ENABLE_X64=1", "JAX_CHECK_TRACER_LEAKS=1"),

@@ -10,8 +10,12 @@ import pytest
 
 import rtd3jax as rtd
 from rtd3jax.system.files import read_arrays, write_arrays
-from rtd3jax.training import checkpoint, lanes, run
-from rtd3jax.training.checkpoint import Checkpoints, checkpoint_steps
+from rtd3jax.training import checkpoint, lanes, train
+from rtd3jax.training.checkpoint import Checkpoints
+from rtd3jax.training.checkpoint_files import checkpoint_steps
+from rtd3jax.training.grouping import with_common_steps
+from rtd3jax.training.jobs import make_jobs
+from rtd3jax.training.lane_identity import is_longer, same
 
 CONFIG = rtd.Config(
     algorithm="h-td3",
@@ -54,7 +58,7 @@ def _interrupt(directory, monkeypatch, **options):
     with monkeypatch.context() as patch:
         patch.setattr(lanes, "_FIRST_CHUNK", 13)
         patch.setattr(lanes, "CHUNK_SECONDS", 0.0)
-        patch.setattr(run.Progress, "update", lambda self, group: interrupt(group))
+        patch.setattr(train.Progress, "update", lambda self, group: interrupt(group))
         with pytest.raises(KeyboardInterrupt):
             _train(directory, checkpoint_seconds=0.0, **options)
     files = list(directory.rglob("*.safetensors"))
@@ -122,7 +126,7 @@ def test_a_lane_that_has_ended_is_kept_while_others_train(tmp_path, monkeypatch)
 
     longer = dataclasses.replace(CONFIG, total_steps=160)
     with monkeypatch.context() as patch:
-        patch.setattr(run.Progress, "update", update)
+        patch.setattr(train.Progress, "update", update)
         with pytest.raises(Killed):
             _train(tmp_path, [CONFIG, longer])
     assert not list(tmp_path.rglob("step-000000160.safetensors"))
@@ -134,7 +138,7 @@ def test_a_lane_that_has_ended_and_is_not_recorded_has_a_checkpoint(tmp_path, wh
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(run.Progress, "update", interrupt)
+        patch.setattr(train.Progress, "update", interrupt)
         with pytest.raises(KeyboardInterrupt):
             _train(tmp_path)
     assert list(tmp_path.rglob(f"step-{CONFIG.total_steps:09d}.safetensors"))
@@ -200,8 +204,8 @@ def test_refused_checkpoints_are_named_before_other_lanes_train(stopped, monkeyp
     # Only `restore` says that no file of a lane can be read.
     for file in newest.parent.iterdir():
         file.write_bytes(b"")
-    (job,) = run.make_jobs(_env(), other, [int(newest.parent.name.removeprefix("seed-"))], cell=0)
-    run._checkpoints([stopped], [other], _env(), None).check(job)
+    (job,) = make_jobs(_env(), other, [int(newest.parent.name.removeprefix("seed-"))], cell=0)
+    train._checkpoints([stopped], [other], _env(), None).check(job)
 
 
 @pytest.mark.parametrize("kept", [False, True])
@@ -227,8 +231,6 @@ def test_an_error_ends_the_training_at_once_unless_checkpoints_keep_the_others(
 def test_another_environment_or_version_is_refused(stopped, monkeypatch):
     with pytest.raises(rtd.UserError, match="another identity .params"):
         _train(stopped, env=rtd.make("rover", disturbance="ar1-slip-fast"))
-    from rtd3jax.training import checkpoint
-
     versions = checkpoint.versions()
     monkeypatch.setattr(checkpoint, "versions", lambda: {**versions, "jax": "9.9"})
     with pytest.raises(rtd.UserError, match="another versions .jax: .* there, 9.9 here"):
@@ -254,8 +256,8 @@ def test_static_options_of_an_environment_identify_a_lane(first, second, differe
     config = dataclasses.replace(CONFIG, total_steps=30, algorithm="td3", history_length=None)
 
     def write(env):
-        checkpoints = run._checkpoints([tmp_path], [config], env, None)
-        (job,) = run.make_jobs(env, config, [0], cell=0)
+        checkpoints = train._checkpoints([tmp_path], [config], env, None)
+        (job,) = make_jobs(env, config, [0], cell=0)
         return checkpoints, job, job.program.init(job.lane)
 
     checkpoints, job, state = write(first)
@@ -293,7 +295,7 @@ def test_a_lane_that_cannot_be_written_does_not_stop_the_others(tmp_path, monkey
         write_arrays(file, *rest)
 
     monkeypatch.setattr(lanes, "_FIRST_CHUNK", 13)
-    monkeypatch.setattr(run.Progress, "update", interrupt)
+    monkeypatch.setattr(train.Progress, "update", interrupt)
     # As under vmap, in one group; under map, each lane is a group of its own.
     for strategy in ("map", "vmap"):
         with pytest.raises(rtd.UserError, match="seed-0 cannot be written: No space left"):
@@ -364,22 +366,22 @@ def test_files_of_later_steps_do_not_outlive_a_lane_that_started_over(tmp_path):
 def test_lanes_that_were_torn_apart_advance_together_from_a_common_step():
     steps = {"a": {224, 284}, "b": {224, 284}, "c": {224}, "d": {224}, "new": set()}
     steps |= {"e": {5_000, 6_000}, "f": {7_000}, "other": set()}
-    parts = lanes.with_common_steps(list(steps), list(steps.values()))
+    parts = with_common_steps(list(steps), list(steps.values()))
     assert parts == [["a", "b", "c", "d"], ["f"], ["e"], ["new", "other"]]
-    assert lanes.with_common_steps([], []) == []
-    assert lanes.with_common_steps(["a", "b"], [set(), set()]) == [["a", "b"]]
+    assert with_common_steps([], []) == []
+    assert with_common_steps(["a", "b"], [set(), set()]) == [["a", "b"]]
 
 
 def test_nan_in_an_identity_is_the_same_nan():
     nan = {"params": [7, float("nan")]}
-    assert checkpoint.same(nan, {"params": [7, float("nan")]})
-    assert not checkpoint.same(nan, {"params": [7, 0.0]})
+    assert same(nan, {"params": [7, float("nan")]})
+    assert not same(nan, {"params": [7, 0.0]})
     longer = {**nan, "total_steps": 40}
-    assert checkpoint.is_longer({"params": [7, float("nan")], "total_steps": 20}, longer)
+    assert is_longer({"params": [7, float("nan")], "total_steps": 20}, longer)
 
 
 def test_typed_keys_survive(tmp_path):
-    from rtd3jax.training.checkpoint import _from_array, _to_array
+    from rtd3jax.training.checkpoint_arrays import _from_array, _to_array
 
     key = jax.random.key(3)
     leaf = jax.eval_shape(lambda: key)
@@ -398,7 +400,7 @@ def test_large_checkpoints_wait_longer_by_default(tmp_path, monkeypatch):
 
     monkeypatch.setattr(checkpoint, "write_arrays", slow_write)
     for seconds, wait in ((None, 900.0), (60.0, 60.0)):
-        checkpoints = checkpoint.Checkpoints(lambda job: tmp_path, lambda job: {}, seconds)
+        checkpoints = Checkpoints(lambda job: tmp_path, lambda job: {}, seconds)
         assert not checkpoints.is_due(group)
         checkpoints.save(group)
         now[0] += wait - 1.0

@@ -5,9 +5,9 @@ import warnings
 import pytest
 
 import rtd3jax as rtd
-from rtd3jax.study.plan import Grid, cell_jobs, make_cells
+from rtd3jax.study.cells import Grid, cell_jobs, make_cells
 from rtd3jax.training.feasibility import updates_of, why_untrained
-from rtd3jax.training.run import make_jobs
+from rtd3jax.training.jobs import make_jobs
 
 SMALL = {"algorithm": "td3", "batch_size": 8, "learning_starts": 20}
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import rtd3jax as rtd
-from rtd3jax.study.plan import Grid, cell_jobs, make_cells
-from rtd3jax.training.run import make_jobs
+from rtd3jax.study.cells import Grid, cell_jobs, make_cells
+from rtd3jax.training.jobs import make_jobs
 
 
 @pytest.mark.parametrize(

@@ -18,8 +18,11 @@ from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.starts import _place, add_starts, starts_of
 from rtd3jax.system.files import read_arrays, write_arrays
 from rtd3jax.training import lanes
-from rtd3jax.training.run import make_jobs
-from rtd3jax.training.start import KNOWN_OBSERVATIONS, Start, starts_of_path
+from rtd3jax.training.grouping import make_groups
+from rtd3jax.training.groups import Group
+from rtd3jax.training.jobs import make_jobs
+from rtd3jax.training.start import KNOWN_OBSERVATIONS, Start
+from rtd3jax.training.starts import starts_of_path
 
 SMALL = dict(
     algorithm="td3",
@@ -150,7 +153,8 @@ def test_a_checkpoint_gives_the_whole_learner(env, kept):
 
 def _checkpoint_state(directory, job):
     from rtd3jax.system.files import read_arrays
-    from rtd3jax.training.checkpoint import checkpoint_files, from_arrays
+    from rtd3jax.training.checkpoint_arrays import from_arrays
+    from rtd3jax.training.checkpoint_files import checkpoint_files
 
     (file, *_) = checkpoint_files(directory / "seed-1")
     return from_arrays(read_arrays(file)[0], job.program, job.lane, file)
@@ -299,7 +303,7 @@ def test_side_by_side_lanes_whose_checkpoints_are_of_no_use_begin_from_the_start
     program = jobs[0].program
     states = jax.jit(jax.vmap(program.init))(lanes.stacked([job.lane for job in jobs], None))
     for job, group_step in zip(jobs, (20, 40), strict=True):
-        (state,) = (s for j, s in lanes.Group(jobs, state=states).lanes() if j is job)
+        (state,) = (s for j, s in Group(jobs, state=states).lanes() if j is job)
         checkpoints.save_lane(job, state, group_step)
         # The newest of both is of step 60, and the first lane's is cut short.
         checkpoints.save_lane(job, state, 60)
@@ -307,7 +311,7 @@ def test_side_by_side_lanes_whose_checkpoints_are_of_no_use_begin_from_the_start
     newest.write_bytes(newest.read_bytes()[:1000])
     add_starts(directory, jobs, write=True)
     assert not directory.lanes.start_path(cell, 0).exists()  # it stands there since they began
-    (group,) = lanes.make_groups(jobs, "vmap", 1, checkpoints=checkpoints)
+    (group,) = make_groups(jobs, "vmap", 1, checkpoints=checkpoints)
     with pytest.warns(UserWarning, match=f"from the beginning, with the actor of {file}"):
         lanes._restore(group, checkpoints, jax.devices()[0])
     begun = lanes._with_start(group, states, jax.devices()[0])
@@ -319,7 +323,7 @@ def test_side_by_side_lanes_whose_checkpoints_are_of_no_use_begin_from_the_start
     jobs = directory.jobs("vmap")
     add_starts(directory, jobs, write=True)
     with pytest.raises(rtd.UserError, match=f"began from {file} cannot start over: .* be read"):
-        lanes._with_start(lanes.Group(jobs), states, jax.devices()[0])
+        lanes._with_start(Group(jobs), states, jax.devices()[0])
 
 
 FLAGS = [

@@ -11,8 +11,10 @@ from gymnax.environments.classic_control.pendulum import Pendulum
 
 import rtd3jax as rtd
 from rtd3jax.training import lanes
-from rtd3jax.training.lanes import make_groups
-from rtd3jax.training.run import make_jobs
+from rtd3jax.training.grouping import make_groups
+from rtd3jax.training.groups import Group
+from rtd3jax.training.jobs import make_jobs
+from rtd3jax.training.pool import Pool
 
 TINY = rtd.Config(
     algorithm="lstm-td3-1ha1hc",
@@ -140,9 +142,9 @@ def test_lengths_side_by_side_equal_exact_windows():
 
     They learn, and an episode ends after 200 steps.
     """
-    from rtd3jax.study.plan import Cell, cell_jobs
+    from rtd3jax.study.cells import Cell, cell_jobs
     from rtd3jax.training.lanes import advance_groups
-    from rtd3jax.training.run import collect
+    from rtd3jax.training.result import collect
 
     configs = [
         dataclasses.replace(TINY, algorithm="h-td3", history_length=length, total_steps=240)
@@ -197,14 +199,14 @@ def test_jax_debug_nans_does_not_end_a_training():
 
 
 def test_a_long_training_without_checkpoints_says_so_once(capsys, monkeypatch, tmp_path):
-    from rtd3jax.training import progress, run
+    from rtd3jax.training import progress, train
 
     group = types.SimpleNamespace(
         jobs=[None], step=10, total=30, began_at=0, returns=np.zeros((1, 1))
     )
     for seconds, times in ((0.0, 1), (60.0, 0)):
         monkeypatch.setattr(progress, "LONG_SECONDS", seconds)
-        with progress.Progress([group], str, remark=run._NO_CHECKPOINTS) as bar:
+        with progress.Progress([group], str, remark=train._NO_CHECKPOINTS) as bar:
             bar.update(group)
             bar.update(group)
         assert capsys.readouterr().err.count("no checkpoints are written") == times
@@ -215,11 +217,11 @@ def test_a_long_training_without_checkpoints_says_so_once(capsys, monkeypatch, t
         remarks.append(remark)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(run, "Progress", begun)
+    monkeypatch.setattr(train, "Progress", begun)
     for directory in (None, tmp_path):
         with pytest.raises(KeyboardInterrupt):
             rtd.train(_rover(), TINY, [0], checkpoint_dir=directory)
-    assert remarks == [run._NO_CHECKPOINTS, ""]
+    assert remarks == [train._NO_CHECKPOINTS, ""]
 
 
 def test_side_by_side_only_lanes_of_the_same_step_advance_together():
@@ -253,8 +255,8 @@ def test_each_device_has_one_group_also_after_an_interrupt(kept, groups):
 
 def test_a_group_stays_on_its_device_unless_that_is_busy():
     jobs = make_jobs(_rover(), TINY, range(3), cell="cell")
-    first, second, third = groups = [lanes.Group([job]) for job in jobs]
-    pool = lanes._Pool(groups)
+    first, second, third = groups = [Group([job]) for job in jobs]
+    pool = Pool(groups)
     assert pool.take("a") is first and pool.take("b") is second
     first.step, second.step, third.step = 60, 40, 50
     pool.give_back(second)
@@ -271,7 +273,7 @@ def test_a_group_stays_on_its_device_unless_that_is_busy():
 
 def test_a_group_that_a_worker_holds_does_not_keep_others_from_being_saved(monkeypatch):
     """An interrupt that ends the wait for a worker leaves a group whose state is in use."""
-    groups = [lanes.Group([job], state="state") for job in make_jobs(_rover(), TINY, range(2))]
+    groups = [Group([job], state="state") for job in make_jobs(_rover(), TINY, range(2))]
     held, other = groups
     taken, saved, found = threading.Event(), threading.Event(), []
 

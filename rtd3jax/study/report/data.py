@@ -17,9 +17,9 @@ import pandas as pd
 
 from rtd3jax.config import Config
 from rtd3jax.errors import UserError
+from rtd3jax.study.cells import Cell
 from rtd3jax.study.colours import colour_of, ordered
 from rtd3jax.study.log import LOG, TASKS, lane_of, read_log, steps_reached
-from rtd3jax.study.plan import Cell
 from rtd3jax.study.results import CELL, is_trained, reference_names, rounded_number
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.statistics import Summary, iqm_bands, reference_mean, summarise

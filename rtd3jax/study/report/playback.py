@@ -22,8 +22,8 @@ from rtd3jax.envs.registry import description_of
 from rtd3jax.errors import UserError, short_reason
 from rtd3jax.evaluation.rollout import element_names, play_episodes
 from rtd3jax.protocols import EnvironmentLike, PolicyLike
+from rtd3jax.study.cells import Cell
 from rtd3jax.study.lane_files import cell_name
-from rtd3jax.study.plan import Cell
 from rtd3jax.study.report.data import rows_of
 from rtd3jax.study.results import rounded_number
 from rtd3jax.study.rundir import RunDirectory

@@ -21,9 +21,9 @@ from rtd3jax.envs.compat.simulator import Fault, Simulator, close_simulators, fa
 from rtd3jax.envs.compat.simulator_state import simulator_handles
 from rtd3jax.envs.compat.surface import surface_of
 from rtd3jax.study.time_estimate import study_seconds
-from rtd3jax.training.lanes import make_groups
+from rtd3jax.training.grouping import make_groups
+from rtd3jax.training.jobs import make_jobs
 from rtd3jax.training.loop import revived
-from rtd3jax.training.run import make_jobs
 
 SMALL = rtd.Config(
     algorithm="td3",
@@ -245,7 +245,7 @@ def test_a_lost_lane_has_no_simulator_of_another_process():
 
 
 def test_a_lane_that_gets_more_steps_takes_no_simulator():
-    from rtd3jax.training.checkpoint import _extended, to_arrays
+    from rtd3jax.training.checkpoint_arrays import extended, to_arrays
 
     env = environment()
     (short,) = make_jobs(env, SMALL, [0])
@@ -254,7 +254,7 @@ def test_a_lane_that_gets_more_steps_takes_no_simulator():
     with env.fleet.in_use():
         state = jax.jit(short.program.init)(short.lane)
         before = dict(env.fleet._busy)
-        arrays = _extended(to_arrays(state), job.program, job.lane)
+        arrays = extended(to_arrays(state), job.program, job.lane)
         assert env.fleet._busy == before and len(before) == 1
     assert len(arrays[".replay.transitions.terminated"]) == 90
     close_simulators()

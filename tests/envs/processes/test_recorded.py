@@ -11,7 +11,7 @@ import rtd3jax as rtd
 from rtd3jax.envs import registry
 from rtd3jax.envs.rover import Rover, RoverParams
 from rtd3jax.errors import UserError
-from rtd3jax.training.checkpoint import read_arrays
+from rtd3jax.system.files import read_arrays
 
 STEPS = 10
 COMMAND = rtd.constant_policy([0.5, 0.0])

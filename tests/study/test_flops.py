@@ -1,4 +1,4 @@
-"""Compares the operations of the plan and the benchmark with XLA's count."""
+"""Compares the operations that `update_flops` counts with XLA's count."""
 
 import dataclasses
 import types
@@ -15,8 +15,7 @@ from rtd3jax.agents.memory import lstm
 from rtd3jax.agents.replay import empty_replay, gather, gather_segments
 from rtd3jax.config import Config
 from rtd3jax.registries import AGENTS
-from rtd3jax.study.derive import _values_and_owners
-from rtd3jax.study.plan import Grid, cell_jobs, make_cells, update_flops
+from rtd3jax.study.flops import update_flops
 
 
 def _unrolled(f, carry, xs, reverse=False):
@@ -109,26 +108,3 @@ def test_operations_are_those_that_xla_counts(algorithm, segments, monkeypatch):
         # left out where the loop is written out.
         least = 1.0 if segments is None else 0.985
         assert least <= ratio <= 1.0 + left_out, (width, ratio)
-
-
-def test_side_by_side_an_environment_has_the_windows_of_its_own_longest():
-    settings = {"total_steps": 40, "learning_starts": 10, "batch_size": 4, "hidden_size": 4}
-    grids = [
-        Grid("rover", ("none",), ("lstm-td3",), (1, 2), settings),
-        Grid("pendulum", ("none",), ("lstm-td3",), (3, 5), settings),
-    ]
-    for strategy, tokens in (("vmap", [2, 2, 5, 5]), ("map", [1, 2, 3, 5])):
-        jobs = cell_jobs(make_cells(grids, {}), [0], strategy)
-        assert [job.program.window_tokens for job in jobs] == tokens
-
-
-def test_fields_in_which_cells_differ_have_their_owners():
-    def cells(env, algorithms, **fields):
-        return [{"env": env, "algorithm": algorithm, **fields} for algorithm in algorithms]
-
-    agents = ("td3", "h-td3")
-    found = cells("rover", agents, gamma=0.0) + cells("pendulum", agents[:1], gamma=0.9)
-    found += cells("pendulum", agents[1:], gamma=0.99)
-    said = "0.0 (rover); 0.9 (pendulum: td3); 0.99 (pendulum: h-td3)"
-    assert _values_and_owners("gamma", found) == said
-    assert _values_and_owners("gamma", found[2:]) == "0.9 (td3); 0.99 (h-td3)"
