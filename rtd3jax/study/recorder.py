@@ -14,7 +14,7 @@ from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.groups import Group
 from rtd3jax.training.jobs import Job
-from rtd3jax.training.loop import HEALTHY, LaneState
+from rtd3jax.training.lane import HEALTHY, LaneState
 from rtd3jax.training.result import curves_of, evaluation_steps, failure_of, metric_curves
 
 

@@ -29,8 +29,8 @@ from rtd3jax.training.checkpoint_files import (
 )
 from rtd3jax.training.groups import Group
 from rtd3jax.training.jobs import Job
+from rtd3jax.training.lane import LaneState
 from rtd3jax.training.lane_identity import difference, is_longer, same, why_not_longer
-from rtd3jax.training.loop import LaneState
 from rtd3jax.training.plant import PLANT
 
 DEFAULT_SECONDS = 300.0

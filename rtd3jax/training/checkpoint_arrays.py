@@ -9,7 +9,8 @@ import numpy as np
 
 from rtd3jax.envs.compat.simulated import release
 from rtd3jax.errors import UserError
-from rtd3jax.training.loop import Lane, LaneState, Program
+from rtd3jax.training.lane import Lane, LaneState
+from rtd3jax.training.loop import Program
 
 
 def to_arrays(state: LaneState) -> dict[str, np.ndarray]:

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 
 from rtd3jax.system.jax_settings import jax_settings
 from rtd3jax.system.program_cache import make_room, on_full
-from rtd3jax.training.loop import Lane, Program
+from rtd3jax.training.lane import Lane
+from rtd3jax.training.loop import Program
 
 _COPIES = 3
 """Number of programs that differ only in the environment object, at which a warning is given."""

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from rtd3jax.training.jobs import Job
-from rtd3jax.training.loop import LaneState
+from rtd3jax.training.lane import LaneState
 
 
 @dataclasses.dataclass(eq=False)
@@ -64,6 +64,6 @@ class Group:
             yield self.jobs[0], self.state
             return
         for index, job in enumerate(self.jobs):
-            with jax.debug_nans(False):  # as in `_work`
+            with jax.debug_nans(False):  # as in the workers: unreached points of curves are NaN
                 state = jax.tree.map(lambda leaf, i=index: leaf[i], self.state)
             yield job, state

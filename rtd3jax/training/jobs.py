@@ -12,7 +12,8 @@ from rtd3jax.protocols import EnvironmentLike
 from rtd3jax.system.switches import check_compiling
 from rtd3jax.training.executables import structure_of
 from rtd3jax.training.feasibility import check_segments, warn_if_untrained
-from rtd3jax.training.loop import Lane, Program, as_arrays, make_lane, make_program
+from rtd3jax.training.lane import Lane, as_arrays, make_lane
+from rtd3jax.training.loop import Program, make_program
 from rtd3jax.training.start import Start
 
 Executable = tuple[Program, Any]

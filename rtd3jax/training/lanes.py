@@ -24,8 +24,9 @@ from rtd3jax.training.checkpoint import Checkpoints
 from rtd3jax.training.devices import workers
 from rtd3jax.training.executables import compiled
 from rtd3jax.training.groups import Group
-from rtd3jax.training.loop import HEALTHY, Lane, LaneState, revived
+from rtd3jax.training.lane import HEALTHY, Lane, LaneState
 from rtd3jax.training.pool import Pool
+from rtd3jax.training.revival import revived
 
 CHUNK_SECONDS = 1.0
 """Target wall time of a chunk: the interval of progress, and the delay after Ctrl-C."""

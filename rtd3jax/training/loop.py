@@ -12,15 +12,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from flax import struct
 from jax import lax
-from jax.typing import ArrayLike
 
 from rtd3jax.agents.agent import Agent, make_agent
 from rtd3jax.agents.bounds import Bounds
 from rtd3jax.agents.history import Steps, Window
 from rtd3jax.agents.hyperparameters import Hyperparameters
-from rtd3jax.agents.memory.base import Carry
 from rtd3jax.agents.noise import add_noise
 from rtd3jax.agents.normalise import Normaliser, Statistics, as_read, normalised
 from rtd3jax.agents.replay import (
@@ -33,13 +30,12 @@ from rtd3jax.agents.replay import (
 )
 from rtd3jax.agents.rows import where_rows
 from rtd3jax.config import Config, traced_fields
-from rtd3jax.envs.compat.simulated import innermost
-from rtd3jax.envs.compat.simulator_state import simulator_state, with_simulator
 from rtd3jax.envs.interface import action_bounds, foreign_code
 from rtd3jax.evaluation.returns import episode_returns
 from rtd3jax.policies.trained import Policy
 from rtd3jax.protocols import EnvironmentLike
 from rtd3jax.system.jax_settings import random_key
+from rtd3jax.training.lane import ENVIRONMENT_NOT_FINITE, HEALTHY, LOSS_NOT_FINITE, Lane, LaneState
 from rtd3jax.training.metrics import (
     Averages,
     averaged,
@@ -49,62 +45,8 @@ from rtd3jax.training.metrics import (
     note_update,
 )
 
-HEALTHY, ENVIRONMENT_NOT_FINITE, LOSS_NOT_FINITE = 0, 1, 2
-
 # Streams of a lane's random numbers; each number is folded into the lane's key once.
-_INIT, _RESET, _STEPS, _EVALUATION, _REVIVED = range(5)
-
-
-@struct.dataclass
-class Lane:
-    """The data in which lanes of one program differ.
-
-    Attributes:
-        seed: uint32 [].
-        hyperparameters: traced numbers of the configuration.
-        env_params: the environment's parameters.
-    """
-
-    seed: jax.Array
-    hyperparameters: Hyperparameters
-    env_params: Any
-
-
-@struct.dataclass
-class LaneState:
-    """The state of a lane between two steps. ``K`` evaluations, ``E`` environments.
-
-    Attributes:
-        learner: the learner's state: networks and optimisers.
-        replay: the replay of transitions.
-        statistics: statistics of the observations, if networks read them normalised; else None.
-        true_statistics: the same of the undisturbed observations, if critics read them.
-        env_state: the state of the environment; with a leading axis for several environments.
-        observation: [E, O], the current observations.
-        previous_action: [E, A], in half ranges; zero at the start of an episode.
-        episode_step: int32 [E], number of steps of the episode so far.
-        carry: the actor's running carry, leaves [E, ...]; None without one.
-        returns: [K], mean return of each evaluation so far.
-        true_returns: [K], mean return of the undisturbed state's reward.
-        metrics: metrics of learning, averaged over each interval between evaluations.
-        failure: int32 [], HEALTHY, or the first quantity that was not finite.
-        failed_at: int32 [], the step of the failure.
-    """
-
-    learner: Any
-    replay: Replay
-    statistics: Statistics | None
-    env_state: Any
-    observation: jax.Array
-    previous_action: jax.Array
-    episode_step: jax.Array
-    carry: Carry | None
-    returns: jax.Array
-    true_returns: jax.Array
-    metrics: Averages
-    failure: jax.Array
-    failed_at: jax.Array
-    true_statistics: Statistics | None = None
+_INIT, _RESET, _STEPS, _EVALUATION, REVIVED = range(5)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,7 +95,7 @@ class Program:
     def init(self, lane: Lane) -> LaneState:
         """The lane before its first step."""
         key = random_key(lane.seed)
-        observation, env_state = self._reset(jax.random.fold_in(key, _RESET), lane)
+        observation, env_state = self.reset(jax.random.fold_in(key, _RESET), lane)
         count = self.config.environments
         return LaneState(
             learner=self.agent.init(jax.random.fold_in(key, _INIT)),
@@ -307,7 +249,7 @@ class Program:
         replay = keep_acting_carry(state.replay, step, state.episode_step, kept)
         return dataclasses.replace(state, replay=replay)
 
-    def _reset(self, key: jax.Array, lane: Lane) -> tuple[jax.Array, Any]:
+    def reset(self, key: jax.Array, lane: Lane) -> tuple[jax.Array, Any]:
         """The first observations [E, O] of the environments, and their state."""
         with foreign_code():
             if self.config.environments == 1:
@@ -443,37 +385,6 @@ class Program:
         )
 
 
-def revived(program: Program, lane: Lane, state: LaneState, step: int) -> LaneState:
-    """Restore the simulators of a lane from a checkpoint; if impossible, begin new episodes."""
-    env: Any = innermost(program.env)
-    simulator = simulator_state(state.env_state)
-    if simulator is None:
-        return state
-    if int(state.failure) != HEALTHY:
-        # Its handles were those of another process, and may be those of other lanes here.
-        none = dataclasses.replace(simulator, handle=jnp.full_like(simulator.handle, -1))
-        return dataclasses.replace(state, env_state=with_simulator(state.env_state, none))
-    found = env.restored(simulator)
-    if found is not None:
-        there = with_simulator(state.env_state, found)
-        return dataclasses.replace(state, env_state=there)
-    root = random_key(lane.seed)
-    key = jax.random.fold_in(jax.random.fold_in(root, _REVIVED), step)
-    observation, env_state = program._reset(key, lane)
-    state = jax.jit(program.cut)(lane, state, jnp.int32(step // program.config.environments))
-    return dataclasses.replace(
-        state,
-        env_state=env_state,
-        observation=observation.astype(jnp.float32).reshape(state.observation.shape),
-        previous_action=jnp.zeros_like(state.previous_action),
-        episode_step=jnp.zeros_like(state.episode_step),
-        carry=jax.tree.map(jnp.zeros_like, state.carry),
-        metrics=dataclasses.replace(
-            state.metrics, episode_return=jnp.zeros_like(state.metrics.episode_return)
-        ),
-    )
-
-
 def make_program(
     env: EnvironmentLike,
     config: Config,
@@ -495,22 +406,6 @@ def make_program(
         warnings.simplefilter("ignore")  # the configuration has given its warnings already
         static = dataclasses.replace(config, **defaults, start=config.start and "trained")
     return Program(env, static, observation_size, action_shape, true_observation_size)
-
-
-def make_lane(config: Config, seed: int, env_params: object) -> Lane:
-    """A lane of the program of `make_program`; its leaves are concrete arrays."""
-    numbers = {name: jnp.float32(getattr(config, name)) for name in traced_fields()}
-    numbers["history_length"] = jnp.int32(config.window_tokens)
-    return Lane(jnp.uint32(seed), Hyperparameters(**numbers), as_arrays(env_params))
-
-
-def as_arrays(env_params: object) -> Any:
-    """The parameters of an environment as JAX arrays; JAX arrays are not copied."""
-    return jax.tree.map(_array, env_params)
-
-
-def _array(leaf: ArrayLike) -> jax.Array:
-    return jnp.asarray(leaf, jnp.float32 if isinstance(leaf, float) else None)
 
 
 def _normaliser(statistics: Statistics | None) -> Normaliser | None:

@@ -11,7 +11,7 @@ from rtd3jax.envs.compat.simulator_state import simulator_state
 from rtd3jax.errors import UserError
 from rtd3jax.policies.trained import Policy
 from rtd3jax.training.jobs import Job
-from rtd3jax.training.loop import ENVIRONMENT_NOT_FINITE, HEALTHY, LOSS_NOT_FINITE, LaneState
+from rtd3jax.training.lane import ENVIRONMENT_NOT_FINITE, HEALTHY, LOSS_NOT_FINITE, LaneState
 
 _REASONS = {
     ENVIRONMENT_NOT_FINITE: "the environment returned an observation or reward that is not finite; "

@@ -21,7 +21,8 @@ from rtd3jax.errors import UserError
 from rtd3jax.policies.trained import Policy
 from rtd3jax.system.files import read_arrays
 from rtd3jax.training.checkpoint_arrays import leaves_from_arrays
-from rtd3jax.training.loop import HEALTHY, Lane, LaneState, Program
+from rtd3jax.training.lane import HEALTHY, Lane, LaneState
+from rtd3jax.training.loop import Program
 
 KNOWN_OBSERVATIONS = 1_000
 """Number of observations for which a policy's statistics count in the statistics of a new lane."""

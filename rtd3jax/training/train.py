@@ -18,8 +18,8 @@ from rtd3jax.training.devices import workers
 from rtd3jax.training.grouping import make_groups
 from rtd3jax.training.groups import Group
 from rtd3jax.training.jobs import Job, make_jobs
+from rtd3jax.training.lane import LaneState
 from rtd3jax.training.lanes import advance_groups
-from rtd3jax.training.loop import LaneState
 from rtd3jax.training.plant import plant_of
 from rtd3jax.training.progress import Progress
 from rtd3jax.training.result import Run, collect

@@ -10,7 +10,8 @@ import rtd3jax as rtd
 from rtd3jax.agents.history import flat
 from rtd3jax.agents.normalise import LIMIT, no_statistics
 from rtd3jax.training.jobs import make_jobs
-from rtd3jax.training.loop import make_lane, make_program
+from rtd3jax.training.lane import make_lane
+from rtd3jax.training.loop import make_program
 
 
 def _statistics(rows):

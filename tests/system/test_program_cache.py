@@ -9,7 +9,8 @@ import rtd3jax as rtd
 from rtd3jax.system import program_cache as programs
 from rtd3jax.training import executables, lanes
 from rtd3jax.training.devices import workers
-from rtd3jax.training.loop import make_lane, make_program
+from rtd3jax.training.lane import make_lane
+from rtd3jax.training.loop import make_program
 
 SETTINGS = {"hidden_size": 4, "batch_size": 4, "learning_starts": 10, "total_steps": 60}
 SETTINGS |= {"eval_every": 30, "eval_episodes": 1}

@@ -10,7 +10,8 @@ import rtd3jax as rtd
 from rtd3jax.agents.networks import act
 from rtd3jax.agents.replay import gather, gather_segments
 from rtd3jax.training.feasibility import updates_of
-from rtd3jax.training.loop import make_lane, make_program
+from rtd3jax.training.lane import make_lane
+from rtd3jax.training.loop import make_program
 
 K, STEPS, CAPACITY, LENGTH = 3, 90, 60, 3
 FIELDS = dict(

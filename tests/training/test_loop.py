@@ -12,7 +12,8 @@ from gymnax.environments import environment, spaces
 from rtd3jax.agents.networks import act, carry_before
 from rtd3jax.agents.replay import gather, gather_segments
 from rtd3jax.config import Config
-from rtd3jax.training.loop import make_lane, make_program
+from rtd3jax.training.lane import make_lane
+from rtd3jax.training.loop import make_program
 
 STEPS = 60
 

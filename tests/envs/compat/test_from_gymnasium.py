@@ -23,7 +23,7 @@ from rtd3jax.envs.compat.surface import surface_of
 from rtd3jax.study.time_estimate import study_seconds
 from rtd3jax.training.grouping import make_groups
 from rtd3jax.training.jobs import make_jobs
-from rtd3jax.training.loop import revived
+from rtd3jax.training.revival import revived
 
 SMALL = rtd.Config(
     algorithm="td3",
