@@ -47,6 +47,12 @@ WINDOWS_WITH_CARRY = (
 _FOLLOWS = {"actor_starts": "learning_starts", "replay_capacity": "total_steps"}
 """Fields that are None by default, and the fields whose values they then have."""
 
+_DERIVED = {"acting": "acting_mode", "segment_length": "segment_steps"}
+"""Fields whose defaults depend on others, and the properties with their values.
+
+They stay None, so that `dataclasses.replace` does not take their defaults for the user's choice.
+"""
+
 
 @dataclasses.dataclass(frozen=True)
 class Config:
@@ -77,7 +83,7 @@ class Config:
     )
     final_learning_rate_fraction: float = _field(
         1.0,
-        "fraction of both learning rates at the last step; the rates fall linearly",
+        "fraction of both learning rates after the last step; the rates fall linearly",
         traced=True,
         low=0,
         high=1,
@@ -225,7 +231,8 @@ class Config:
             if not isinstance(getattr(self, name), str):
                 raise UserError(f"{name} must be a string, not {getattr(self, name)!r}")
         for part in self.frozen:
-            if part.split(".")[0] not in ("actor", "critics"):
+            whose, point, layer = part.partition(".")
+            if whose not in ("actor", "critics") or bool(point) != bool(layer):
                 raise UserError(
                     f"freeze: {part!r} is not actor, critics, or a layer of these, such as "
                     "actor.memory"
@@ -254,7 +261,7 @@ class Config:
             object.__setattr__(self, "history_length", DEFAULT_HISTORY_LENGTH)
 
     def _resolve_replay(self) -> None:
-        """Set the defaults of ``replay`` and ``acting``, which have no effect without a history."""
+        """Check ``replay``, ``acting`` and segments, which have no effect without a history."""
         check_choice("replay", self.replay, REPLAYS)
         if self.acting is not None:
             check_choice("acting", self.acting, ACTINGS)
@@ -263,16 +270,16 @@ class Config:
             if not isinstance(value, bool):
                 raise UserError(f"{name} must be True or False, not {value!r}")
         segments = self.replay == "segments" and self.has_window
-        resolved: dict[str, Any] = {"replay": "segments" if segments else "windows"}
-        if self.acting is None or not self.has_window:
-            resolved["acting"] = "carry" if segments else "window"
+        object.__setattr__(self, "replay", "segments" if segments else "windows")
+        if not self.has_window:
+            object.__setattr__(self, "acting", None)
         elif self.acting == "carry" and not segments:
             warnings.warn(WINDOWS_WITH_CARRY, stacklevel=4)
         if not segments:
             if self.segment_length and self.has_window:
                 raise UserError(
                     f"segment_length={self.segment_length} needs replay='segments': with windows, "
-                    "every transition has its own history"
+                    "every transition has its own history; leave it out, or pass None"
                 )
             if self.burn_in_gradient and self.has_window:
                 warnings.warn(
@@ -280,12 +287,7 @@ class Config:
                     "replay='segments'",
                     stacklevel=4,
                 )
-            resolved["segment_length"] = 0
-        elif self.segment_length is None and (batch := _as_number(self.batch_size, True)):
-            divisors = range(1, DEFAULT_SEGMENT_LENGTH + 1)
-            resolved["segment_length"] = max(m for m in divisors if batch % m == 0)
-        for name, value in resolved.items():
-            object.__setattr__(self, name, value)
+            object.__setattr__(self, "segment_length", None)
 
     def _check_environments(self) -> None:
         count, capacity = self.environments, self.capacity
@@ -367,19 +369,28 @@ class Config:
     @property
     def acting_mode(self) -> Acting:
         """How the agent acts: with a ``window``, or with a running ``carry``."""
-        assert self.acting is not None  # `__post_init__` has set it
-        return self.acting
+        return self.acting or self._default_acting
+
+    @property
+    def _default_acting(self) -> Acting:
+        return "carry" if self.replay == "segments" else "window"
 
     @property
     def has_running_carry(self) -> bool:
         """Whether the agent acts with a carry that it updates from the start of the episode."""
-        return self.acting == "carry"
+        return self.acting_mode == "carry"
 
     @property
     def segment_steps(self) -> int:
         """Consecutive transitions in a segment, m; 0 with windows."""
-        assert self.segment_length is not None  # `__post_init__` has set it
-        return self.segment_length
+        if self.replay == "windows":
+            return 0
+        return self._default_segment_steps if self.segment_length is None else self.segment_length
+
+    @property
+    def _default_segment_steps(self) -> int:
+        divisors = range(1, DEFAULT_SEGMENT_LENGTH + 1)
+        return max(m for m in divisors if self.batch_size % m == 0)
 
     @property
     def frozen(self) -> tuple[str, ...]:
@@ -436,14 +447,16 @@ class Config:
 
     def to_dict(self) -> dict[str, Any]:
         """The fields as JSON-ready values, with the defaults that depend on other fields."""
-        return {**dataclasses.asdict(self), **{name: self._followed(name) for name in _FOLLOWS}}
+        derived = {name: getattr(self, value) for name, value in _DERIVED.items()}
+        followed = {name: self._followed(name) for name in _FOLLOWS}
+        return {**dataclasses.asdict(self), **derived, **followed}
 
     @classmethod
     def from_dict(cls, fields: Mapping[str, Any]) -> "Config":
         """The configuration that `to_dict` wrote, in this version or an earlier one.
 
-        ``actor_starts`` and ``replay_capacity`` become None again if they equal
-        ``learning_starts`` and ``total_steps``, so that they follow these fields.
+        ``actor_starts``, ``replay_capacity``, ``acting`` and ``segment_length`` become None again
+        if they have the values that follow from other fields.
 
         Raises:
             UserError: when a value is impossible.
@@ -453,7 +466,17 @@ class Config:
         for name, other in _FOLLOWS.items():
             if given.get(name) == given.get(other, getattr(cls, other)):
                 del given[name]
-        return cls(**given)
+        if not given.get("segment_length"):
+            given.pop("segment_length", None)  # 0 with windows
+        config = cls(**given)
+        defaults = {
+            "acting": config._default_acting,
+            "segment_length": config._default_segment_steps,
+        }
+        for name, default in defaults.items():
+            if getattr(config, name) == default:
+                object.__setattr__(config, name, None)
+        return config
 
 
 def traced_fields() -> tuple[str, ...]:

@@ -89,6 +89,22 @@ def test_a_configuration_is_read_as_it_was_written(given):
     assert rtd.Config.from_dict(fields).actor_starts is None
 
 
+def test_defaults_of_windows_do_not_stay_with_segments():
+    windows, segments = rtd.Config(), rtd.Config(replay="segments")
+    assert dataclasses.replace(windows, replay="segments") == segments
+    assert dataclasses.replace(segments, replay="windows") == windows
+    assert (segments.acting_mode, segments.segment_steps) == ("carry", 10)
+    assert dataclasses.replace(segments, batch_size=64).segment_steps == 8
+    chosen = rtd.Config(replay="segments", acting="window", segment_length=5)
+    assert (chosen.acting_mode, chosen.segment_steps) == ("window", 5)
+    for config in (windows, segments, chosen):
+        assert rtd.Config.from_dict(config.to_dict()) == config
+    changed = rtd.Config.from_dict({**windows.to_dict(), "replay": "segments"})
+    assert changed.segment_steps == 10
+    with pytest.raises(rtd.UserError, match="leave it out, or pass None"):
+        dataclasses.replace(chosen, replay="windows")
+
+
 def test_choices_and_numbers_are_read_from_the_command_line():
     words = "--env rover --precision bfloat16 --replay segments --acting window --gamma 0.5"
     options = parser(None).parse_args([*words.split(), "--segment-length", "5", "--start", "7"])

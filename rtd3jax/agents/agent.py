@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import jax
 
-from rtd3jax.agents.freeze import check_parts, frozen_parts, waiting_actor
+from rtd3jax.agents.freeze import check_fields, check_parts, frozen_parts, waiting_actor
 from rtd3jax.agents.history import Window, next_window
 from rtd3jax.agents.hyperparameters import Hyperparameters
 from rtd3jax.agents.learners.base import Learner, Metrics, Networks
@@ -243,12 +243,16 @@ def make_agent(config: Config, interface: Sizes) -> Agent:
         make_part(variant, role, config.memory, *sizes, config.precision, truth)
         for role in ("actor", "critic")
     )
-    check_parts(config.frozen, {"actor": actor, "critics": critic})
+    networks, learner = Networks(actor, critic), LEARNERS[variant.learner](config)
+    if config.frozen:
+        check_parts(config.frozen, {"actor": actor, "critics": critic})
+        state = jax.eval_shape(lambda: learner.init(jax.random.key(0), networks))
+        check_fields(config.frozen, state, variant.learner)
     return Agent(
         variant=variant,
-        networks=Networks(actor, critic),
+        networks=networks,
         acting_actor=make_part(variant, "actor", config.memory, *sizes),
-        learner=LEARNERS[variant.learner](config),
+        learner=learner,
         config=config,
         observation_size=interface.observation_size,
         action_size=interface.action_size,

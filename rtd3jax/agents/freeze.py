@@ -33,6 +33,16 @@ def check_parts(parts: Sequence[str], networks: Mapping[str, Network]) -> None:
             )
 
 
+def check_fields(parts: Sequence[str], state: object, learner: str) -> None:
+    """Raise UserError if the state of a learner has no field for the network of a part."""
+    for whose in dict.fromkeys(part.partition(".")[0] for part in parts):
+        if not hasattr(state, whose):
+            raise UserError(
+                f"freeze: the state of learner {learner!r} has no field {whose!r}, only "
+                f"{', '.join(vars(state))}"
+            )
+
+
 def frozen_parts(before: State, after: State, parts: Sequence[str]) -> State:
     """The state ``after`` an update, in which ``parts`` keep their values ``before`` it."""
     if not parts:

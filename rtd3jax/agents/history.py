@@ -76,7 +76,8 @@ class Segment:
         begins: bool [M], whether the first token of the burn-in is the first of an episode.
         start: the behaviour actor's carry before the first token of the burn-in, leaves [M, ...].
             An actor that acts with a running carry starts from it (stored state and burn-in, as in
-            Kapturowski et al., 2019). None if histories start with a zero carry.
+            Kapturowski et al., 2019). None if histories start with a zero carry. A burn-in that
+            would begin before the oldest step in the ring starts there, with a zero carry.
         following: whether the current step is the step after each of the m steps.
         burn_in_gradient: whether gradients flow into the burn-in.
         true_observation: [B, S], as in `Window`.

@@ -43,6 +43,10 @@ class NetworkSpec:
     current: tuple[str, ...] = ()
     carry_from_replay: bool = False
 
+    def __post_init__(self) -> None:
+        for name in ("memory", "current"):  # lists would not be hashable
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+
 
 class Linear(nn.Module):
     """``x @ kernel + bias`` [B, outputs]; initial values are uniform in ±1/sqrt(inputs).

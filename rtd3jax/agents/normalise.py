@@ -45,27 +45,37 @@ class Statistics:
 
     Attributes:
         count: int32 [], number of observations so far.
-        mean: [O].
+        origin: [O], the first observation. Means are relative to it: beside a large offset, float32
+            would round the small changes of a mean to zero.
+        relative_mean: [O], the mean of the observations minus ``origin``.
         variance: [O], the population variance of these observations.
     """
 
     count: jax.Array
-    mean: jax.Array
+    origin: jax.Array
+    relative_mean: jax.Array
     variance: jax.Array
+
+    @property
+    def mean(self) -> jax.Array:
+        """[O], in the observation's units."""
+        return self.origin + self.relative_mean
 
     def note(self, observations: jax.Array) -> "Statistics":
         """The statistics after K more ``observations`` [K, O] (Welford 1962; Chan et al. 1983)."""
         number = observations.shape[0]
         count = self.count + jnp.int32(number)
         share = number / count.astype(jnp.float32)
-        centre = jnp.mean(observations, axis=0)
-        within = jnp.mean(jnp.square(observations - centre[None, :]), axis=0)
-        change = centre - self.mean
-        mean = self.mean + share * change
+        origin = jnp.where(self.count == 0, observations[0], self.origin)
+        relative = observations - origin[None, :]
+        centre = jnp.mean(relative, axis=0)
+        within = jnp.mean(jnp.square(relative - centre[None, :]), axis=0)
+        change = centre - self.relative_mean
+        mean = self.relative_mean + share * change
         # The mean of squares, not their sum: the mean does not grow, so float32 resolves it.
         between = (1.0 - share) * jnp.square(change)
         variance = self.variance + share * (within + between - self.variance)
-        return Statistics(count, mean, variance)
+        return Statistics(count, origin, mean, variance)
 
     def normaliser(self) -> Normaliser:
         """The normalisation with these statistics."""
@@ -77,7 +87,7 @@ class Statistics:
 def no_statistics(observation_size: int) -> Statistics:
     """The statistics of zero observations."""
     zeros = jnp.zeros((observation_size,), jnp.float32)
-    return Statistics(jnp.int32(0), zeros, zeros)
+    return Statistics(jnp.int32(0), zeros, zeros, zeros)
 
 
 def as_read(observation: jax.Array, normaliser: Normaliser | None) -> jax.Array:

@@ -10,6 +10,7 @@ from rtd3jax.config import Config
 from rtd3jax.envs.registry import make
 from rtd3jax.errors import UserError
 from rtd3jax.training.jobs import Job, make_jobs
+from rtd3jax.training.loop import static_part
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,9 +97,9 @@ def cell_jobs(
 ) -> list[Job]:
     """A job for each cell and seed, with key ``(cell, seed)``.
 
-    Side by side (``vmap``), all history lengths in an environment share the program of the longest
-    one: there, a wider matrix product costs almost nothing more. One by one (``map``), each history
-    length has a program of its own.
+    Side by side (``vmap``), cells of an environment that only differ in history length and in
+    traced fields share the program of the longest window: there, a wider matrix product costs
+    almost nothing more. One by one (``map``), each history length has a program of its own.
 
     Args:
         cells: the cells of the study.
@@ -116,14 +117,15 @@ def cell_jobs(
 
 
 def _windows(cells: Sequence[Cell], stages: Sequence[int]) -> list[int]:
-    """For each cell, the longest window of its environment in the cells up to its stage."""
-    longest: dict[str, int] = {}
+    """For each cell, the longest window of the cells up to its stage that can share its program."""
+    longest: dict[Any, int] = {}
     found: list[int] = []
     for end in (*stages, len(cells)):
         stage = cells[len(found) : end]
-        for cell in stage:
-            longest[cell.env] = max(longest.get(cell.env, 0), cell.config.window_tokens)
-        found += [longest[cell.env] for cell in stage]
+        programs = [(cell.env, static_part(cell.config, window=1)) for cell in stage]
+        for cell, program in zip(stage, programs, strict=True):
+            longest[program] = max(longest.get(program, 0), cell.config.window_tokens)
+        found += [longest[program] for program in programs]
     return found
 
 

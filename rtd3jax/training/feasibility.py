@@ -11,6 +11,8 @@ _ZERO = {
     "tau": "the target networks will not change",
     "reward_scale": "all rewards in updates will be 0",
 }
+_OF = {"actor_learning_rate": "actor", "critic_learning_rate": "critics"}
+"""The network to which a field applies; it has no effect if the network is frozen."""
 
 
 def updates_of(config: Config) -> tuple[int, int]:
@@ -46,7 +48,7 @@ def why_untrained(config: Config) -> str | None:
             "lower policy_delay or update_every, or raise total_steps"
         )
     for name, what in _ZERO.items():
-        if getattr(config, name) == 0:
+        if getattr(config, name) == 0 and _OF.get(name) not in config.frozen:
             return f"{name} is 0, so {what}: raise {name}"
     return None
 

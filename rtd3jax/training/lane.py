@@ -14,7 +14,7 @@ from rtd3jax.agents.replay import Replay
 from rtd3jax.config import Config, traced_fields
 from rtd3jax.training.metrics import Averages
 
-HEALTHY, ENVIRONMENT_NOT_FINITE, LOSS_NOT_FINITE = 0, 1, 2
+HEALTHY, ENVIRONMENT_NOT_FINITE, LOSS_NOT_FINITE, ACTION_NOT_FINITE = range(4)
 
 
 @struct.dataclass

@@ -35,7 +35,14 @@ from rtd3jax.evaluation.returns import episode_returns
 from rtd3jax.policies.trained import Policy
 from rtd3jax.protocols import EnvironmentLike
 from rtd3jax.system.jax_settings import random_key
-from rtd3jax.training.lane import ENVIRONMENT_NOT_FINITE, HEALTHY, LOSS_NOT_FINITE, Lane, LaneState
+from rtd3jax.training.lane import (
+    ACTION_NOT_FINITE,
+    ENVIRONMENT_NOT_FINITE,
+    HEALTHY,
+    LOSS_NOT_FINITE,
+    Lane,
+    LaneState,
+)
 from rtd3jax.training.metrics import (
     Averages,
     averaged,
@@ -55,7 +62,7 @@ class Program:
 
     Attributes:
         env: the environment, compared by its `__eq__`.
-        config: the configuration with traced fields at their defaults; see `make_program`.
+        config: the configuration with traced fields at their defaults; see `static_part`.
         observation_size: O.
         action_shape: shape of the environment's action.
         true_observation_size: S; 0 if the environment does not give the undisturbed observation.
@@ -154,7 +161,7 @@ class Program:
 
         statistics = state.statistics
         if statistics is not None:
-            statistics = statistics.note(state.observation)
+            statistics = self._noted(statistics, state.observation, step)
         true_statistics = state.true_statistics
         if true_statistics is not None:
             true_statistics = true_statistics.note(self._truth(state.env_state, lane))
@@ -203,8 +210,9 @@ class Program:
             # Always false: a loss is never negative, and an action never exceeds one.
             never=(loss < 0.0) & jnp.all(action > 1.0),
         )
-        told = state.observation, final_observation, reward, truth
-        finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(told)]))
+        # An action that is not finite is the actor's fault, unless its observation is not finite.
+        strayed = _finite(state.observation) & ~_finite(action)
+        finite = _finite((state.observation, final_observation, reward, truth))
         state = dataclasses.replace(
             state,
             learner=learner,
@@ -219,9 +227,24 @@ class Program:
             metrics=note_reward(metrics, reward, done),
         )
         at = step * self.config.environments
+        state = _note_failure(state, at, strayed, ACTION_NOT_FINITE)
         state = _note_failure(state, at, ~finite, ENVIRONMENT_NOT_FINITE)
         state = _note_failure(state, at, ~jnp.isfinite(loss), LOSS_NOT_FINITE)
         return self._evaluate(lane, state, (step + 1) * self.config.environments)
+
+    def _noted(self, before: Statistics, observations: jax.Array, step: jax.Array) -> Statistics:
+        """The statistics after ``observations`` [E, O].
+
+        A trained actor that is frozen, or is not updated yet, reads observations as it was trained
+        to: the statistics with which it came stay.
+        """
+        after = before.note(observations)
+        if not self.config.start:
+            return after
+        if "actor" in self.config.frozen:
+            return before
+        learns = step * self.config.environments >= self.config.first_actor_step
+        return jax.tree.map(functools.partial(jnp.where, learns), after, before)
 
     def _window(
         self, lane: Lane, state: LaneState, step: jax.Array, normaliser: Normaliser | None
@@ -393,7 +416,13 @@ def make_program(
     window: int | None = None,
     true_observation_size: int = 0,
 ) -> Program:
-    """The program of lanes that only differ in traced numbers.
+    """The program of lanes that only differ in traced numbers; see `static_part`."""
+    static = static_part(config, window)
+    return Program(env, static, observation_size, action_shape, true_observation_size)
+
+
+def static_part(config: Config, window: int | None = None) -> Config:
+    """The configuration of the program of lanes that only differ in traced numbers.
 
     With ``window``, lanes may also differ in their history length, up to ``window``: the arrays of
     the window have this length, and tokens beyond the history length of a lane do not exist for it.
@@ -404,12 +433,16 @@ def make_program(
         defaults["history_length"] = window
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the configuration has given its warnings already
-        static = dataclasses.replace(config, **defaults, start=config.start and "trained")
-    return Program(env, static, observation_size, action_shape, true_observation_size)
+        return dataclasses.replace(config, **defaults, start=config.start and "trained")
 
 
 def _normaliser(statistics: Statistics | None) -> Normaliser | None:
     return None if statistics is None else statistics.normaliser()
+
+
+def _finite(values: Any) -> jax.Array:
+    """Whether all elements of all arrays are finite, bool []."""
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(values)]))
 
 
 def _note_failure(state: LaneState, step: jax.Array, seen: jax.Array, code: int) -> LaneState:

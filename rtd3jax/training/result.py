@@ -11,13 +11,20 @@ from rtd3jax.envs.compat.simulator_state import simulator_state
 from rtd3jax.errors import UserError
 from rtd3jax.policies.trained import Policy
 from rtd3jax.training.jobs import Job
-from rtd3jax.training.lane import ENVIRONMENT_NOT_FINITE, HEALTHY, LOSS_NOT_FINITE, LaneState
+from rtd3jax.training.lane import (
+    ACTION_NOT_FINITE,
+    ENVIRONMENT_NOT_FINITE,
+    HEALTHY,
+    LOSS_NOT_FINITE,
+    LaneState,
+)
 
 _REASONS = {
     ENVIRONMENT_NOT_FINITE: "the environment returned an observation or reward that is not finite; "
     "check its reset and step functions",
     LOSS_NOT_FINITE: "the critics' loss is not finite; lower actor_learning_rate and "
     "critic_learning_rate",
+    ACTION_NOT_FINITE: "the actor's action is not finite; lower actor_learning_rate",
 }
 
 

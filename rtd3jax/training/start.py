@@ -153,11 +153,9 @@ class Start:
 
 
 def _statistics_of(normaliser: Normaliser) -> Statistics:
-    return Statistics(
-        jnp.int32(KNOWN_OBSERVATIONS),
-        _copy(normaliser.mean),
-        1.0 / jnp.square(_copy(normaliser.scale)),
-    )
+    mean, scale = _copy(normaliser.mean), _copy(normaliser.scale)
+    count = jnp.int32(KNOWN_OBSERVATIONS)
+    return Statistics(count, mean, jnp.zeros_like(mean), 1.0 / jnp.square(scale))
 
 
 def _copy(array: jax.Array) -> jax.Array:

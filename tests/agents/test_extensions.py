@@ -179,6 +179,12 @@ def test_the_actor_of_an_added_learner_waits_as_long_as_it_is_told():
     assert moved("actor") == [21] and moved("critic") == list(range(1, 22))
 
 
+def test_what_an_added_learner_cannot_freeze_is_one_line():
+    fields = {**TINY, "history_length": None, "freeze": "critics.head"}
+    with pytest.raises(rtd.UserError, match="learner 'ddpg' has no field 'critics', only actor, c"):
+        make_jobs(rtd.make("rover", "ar1-slip"), rtd.Config(algorithm="dpg", **fields), [0])
+
+
 def test_a_seventh_agent_sweeps_draws_reports_and_loads(tmp_path, pictures):
     out = tmp_path / "run"
     flags = [f"--{name.replace('_', '-')}={value}" for name, value in TINY.items()]
@@ -208,5 +214,7 @@ def test_agents_that_cannot_be_trained_are_one_line():
     for variant, message in cases:
         with pytest.raises(rtd.UserError, match=message):
             rtd.register_agent("mine", variant)
+    lists = rtd.NetworkSpec(current=["observation"]), rtd.NetworkSpec(current=[*critic.current])
+    assert rtd.Variant(*lists) == rtd.Variant(reads, critic) and hash(rtd.Variant(*lists))
     with pytest.raises(rtd.UserError, match="'td3' is already registered"):
         rtd.register_agent("td3", rtd.Variant(reads, critic))

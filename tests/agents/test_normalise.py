@@ -33,6 +33,15 @@ def test_the_statistics_are_those_of_all_that_was_seen():
     np.testing.assert_allclose(read.mean(0), 0, atol=2e-3)
 
 
+def test_the_mean_follows_a_change_that_is_small_beside_the_sensors_zero():
+    rows = np.random.default_rng(0).normal(101_325, 5, (30_000, 1))  # a barometer, in pascals
+    rows[5_000:] += 20
+    rows = rows.astype(np.float32).astype(np.float64)
+    found = _statistics(rows)
+    np.testing.assert_allclose(found.mean, rows.mean(0), atol=0.02)
+    np.testing.assert_allclose(np.sqrt(found.variance), rows.std(0), rtol=1e-3)
+
+
 @pytest.mark.parametrize("rows", [[[3.0, 1e6]], [[3.0, 1e6]] * 50])
 def test_an_element_that_does_not_change_is_centred_only(rows):
     normaliser = _statistics(np.array(rows)).normaliser()

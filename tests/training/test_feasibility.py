@@ -52,7 +52,14 @@ def test_a_sweep_says_it_too():
 
 
 @pytest.mark.parametrize(
-    "changes", [{"total_steps": 22}, {"total_steps": 23, "update_every": 2}, {"total_steps": 40}]
+    "changes",
+    [
+        {"total_steps": 22},
+        {"total_steps": 23, "update_every": 2},
+        {"total_steps": 40},
+        {"total_steps": 40, "freeze": "actor", "actor_learning_rate": 0},
+        {"total_steps": 40, "freeze": "critics", "critic_learning_rate": 0},
+    ],
 )
 def test_what_trains_is_silent(changes):
     with warnings.catch_warnings():

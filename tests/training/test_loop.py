@@ -136,7 +136,7 @@ def test_the_newest_row_has_its_next_carry_when_its_episode_is_cut(lane):
 def test_segments_go_on_from_the_carry_that_was_stored(lane, burn_in_gradient):
     """While the actor stays the same, a short burn-in from there is as good as a whole episode."""
     program, _, state = lane
-    if program.config.acting == "window":
+    if program.config.acting_mode == "window":
         pytest.skip("no carry runs on")
     count, length, burn_in = jnp.int32(STEPS), 3, 2
     first = jnp.arange(STEPS - length, dtype=jnp.int32)

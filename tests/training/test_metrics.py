@@ -1,13 +1,17 @@
 """Tests that metrics of learning are averages over the steps between two evaluations."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from flax import struct
 from gymnax.environments import environment, spaces
 
 import rtd3jax as rtd
 from rtd3jax.agents.learners.base import Measured
+from rtd3jax.training.jobs import make_jobs
 from rtd3jax.training.metrics import averaged, empty_averages, note_reward, note_update
 
 
@@ -77,6 +81,23 @@ def test_a_run_has_the_metrics_of_each_interval():
     assert ((shares >= 0) & (shares <= 1)).all()
     for name in ("critic_gradient_norm", "actor_gradient_norm", "actor_loss"):
         assert np.isfinite(metrics[name][:, 1:]).all(), name
+
+
+@pytest.mark.parametrize(
+    ("delay", "updates"), [(1, [16, 32]), (2, [16, 32]), (3, [15, 30]), (40, [40])]
+)
+def test_the_actors_norm_is_measured_at_about_every_sixteenth_update(delay, updates):
+    config = rtd.Config("td3", policy_delay=delay, hidden_size=4, batch_size=4, total_steps=50)
+    (job,) = make_jobs(Steady(), dataclasses.replace(config, learning_starts=10), [0])
+    agent, keys = job.program.agent, jax.random.split(jax.random.key(0), 3)
+    numbers, replay = job.lane.hyperparameters, jax.jit(job.program.init)(job.lane).replay
+    batch = agent.sample(replay, keys[0], jnp.int32(20), numbers.history_length, None)
+    update, learner = jax.jit(agent.update), jax.jit(agent.init)(keys[0])
+    found = []
+    for count in range(1, 45):
+        _, metrics = update(learner, batch, keys[1:], numbers, jnp.int32(count))
+        found += [count] if float(metrics["actor_gradient_norm"].times) else []
+    assert found == updates
 
 
 def test_the_actors_norm_is_that_of_its_gradient():

@@ -45,17 +45,17 @@ def test_a_carry_beyond_the_windows_is_warned_of():
         rtd.Config(acting="carry")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert rtd.Config(replay="segments").acting == "carry"
-        assert rtd.Config(replay="segments", acting="window").acting == "window"
+        assert rtd.Config(replay="segments").acting_mode == "carry"
+        assert rtd.Config(replay="segments", acting="window").acting_mode == "window"
         config = rtd.Config("td3", replay="segments", segment_length=10, acting="carry")
-        assert (config.replay, config.acting, config.segment_length) == ("windows", "window", 0)
+        assert (config.replay, config.acting_mode, config.segment_steps) == ("windows", "window", 0)
 
 
 @pytest.mark.parametrize("batch_size, length", [(100, 10), (50, 10), (8, 8), (14, 7), (13, 1)])
 def test_the_default_length_divides_the_batch(batch_size, length):
     for kind in (int, float, np.int64):
         config = rtd.Config(replay="segments", batch_size=kind(batch_size))
-        assert (config.batch_size, config.segment_length) == (batch_size, length)
+        assert (config.batch_size, config.segment_steps) == (batch_size, length)
 
 
 def test_a_gradient_of_the_burn_in_without_a_burn_in_is_a_warning():

@@ -83,16 +83,18 @@ def test_a_lane_acts_by_the_policy_while_parts_stay_and_the_actor_waits(env, kep
     advance = jax.jit(job.program.advance)
     acted = advance(job.lane, state, jnp.int32(0), jnp.int32(10))
     rows = acted.replay.transitions.step
-    # Its statistics hardly move in ten steps, so that it acts as the policy does.
+    # Its statistics stay while it waits, so that it acts as the policy does.
     memory = policy.init()
     for observation, action in zip(rows.observation[:10], rows.action[:10], strict=True):
         expected, memory = policy.step(memory, observation)
-        np.testing.assert_allclose(action, expected, atol=0.1)
+        np.testing.assert_allclose(action, expected, atol=1e-5)
     waiting = advance(job.lane, acted, jnp.int32(10), jnp.int32(40))
     assert _same(waiting.learner.actor, policy.actor)
     assert _same(waiting.learner.target_actor, policy.actor)
     assert not _same(waiting.learner.target_critics, state.learner.target_critics)
+    assert _same(waiting.statistics, state.statistics)
     later = advance(job.lane, waiting, jnp.int32(40), jnp.int32(44))
+    assert int(later.statistics.count) == KNOWN_OBSERVATIONS + 4
     actor = {
         layer: _same(policy.actor[layer], later.learner.actor[layer]) for layer in policy.actor
     }
@@ -106,6 +108,16 @@ def test_a_lane_acts_by_the_policy_while_parts_stay_and_the_actor_waits(env, kep
         assert critic == {"current": True, "head": False, "output": False}
     targets = before.target_actor, after.target_actor
     assert {layer: _same(targets[0][layer], targets[1][layer]) for layer in actor} == actor
+
+
+def test_a_frozen_actor_reads_observations_as_it_was_trained_to(env, kept):
+    run, _ = kept
+    start = Start("p", run.policy(0))
+    (job,) = make_jobs(env, _config(start="p", freeze="actor"), [0], starts={0: start})
+    state = start.begin(job.program, job.lane, jax.jit(job.program.init)(job.lane))
+    later = jax.jit(job.program.advance)(job.lane, state, jnp.int32(0), jnp.int32(30))
+    assert _same(later.statistics, state.statistics)
+    assert not _same(later.learner.critics, state.learner.critics)
 
 
 @pytest.mark.parametrize("algorithm", ["lstm-td3", "lstm-td3-1ha1hc", "h-td3"])
@@ -187,6 +199,7 @@ def test_each_seed_goes_on_from_its_own_and_with_others_the_same(env, kept):
         (dict(normalise_observations=False), "has normalise_observations=True"),
         (dict(freeze="actor.heart"), "actor has no layer 'heart'.*head.*its layers are"),
         (dict(freeze="body"), "'body' is not actor, critics"),
+        (dict(freeze="actor.,critics."), "'actor.' is not actor, critics"),
         (dict(start=3), "start must be a string"),
     ],
 )

@@ -5,16 +5,18 @@ import threading
 import types
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnax.environments.classic_control.pendulum import Pendulum
 
 import rtd3jax as rtd
-from rtd3jax.training import lanes
+from rtd3jax.training import devices, lanes
 from rtd3jax.training.grouping import make_groups
 from rtd3jax.training.groups import Group
 from rtd3jax.training.jobs import make_jobs
 from rtd3jax.training.pool import Pool
+from rtd3jax.training.result import failure_of
 
 TINY = rtd.Config(
     algorithm="lstm-td3-1ha1hc",
@@ -334,7 +336,17 @@ def test_an_observation_of_reset_that_is_not_finite_is_the_environments_fault():
     assert failure.step == 0 and "the environment returned an observation" in failure.reason
 
 
+def test_an_actor_that_diverged_is_not_the_environments_fault():
+    (job,) = make_jobs(_rover(), dataclasses.replace(TINY, algorithm="td3"), [0])
+    state = jax.jit(job.program.init)(job.lane)
+    actor = jax.tree.map(lambda leaf: leaf + jnp.nan, state.learner.actor)
+    state = dataclasses.replace(state, learner=dataclasses.replace(state.learner, actor=actor))
+    state = jax.jit(job.program.advance)(job.lane, state, jnp.int32(0), jnp.int32(40))
+    failure = failure_of(0, state)
+    assert failure.step == 20 and "the actor's action is not finite" in failure.reason
+
+
 def test_the_default_device_may_be_named_by_its_platform():
     with jax.default_device("cpu"):
-        assert lanes.default_strategy() == "map"
-        assert {device.platform for device in lanes.workers()} == {"cpu"}
+        assert devices.default_strategy() == "map"
+        assert {device.platform for device in devices.workers()} == {"cpu"}

@@ -104,12 +104,13 @@ class TD3:
     ) -> tuple[TD3State, Metrics]:
         """Update the critics, and every ``policy_delay``-th time the actor and the targets."""
         norms = count % NORMS_EVERY == 0
+        actors_norm = count // self.policy_delay % max(1, NORMS_EVERY // self.policy_delay) == 0
         new, critic = update_critics(networks, state, batch, keys[0], hyperparameters, norms)
         state = frozen_parts(state, new, self.frozen)
         state, actor = lax.cond(
             count % self.policy_delay == 0,
             lambda before: update_actor_and_targets(
-                networks, before, batch, keys[1], hyperparameters, norms, self.frozen
+                networks, before, batch, keys[1], hyperparameters, actors_norm, self.frozen
             ),
             lambda before: (before, {name: not_measured() for name in ACTOR_METRICS}),
             state,
