@@ -10,10 +10,10 @@ A claim of a positive effect is *supported* if the interval lies above zero, and
 it lies below zero. The verdict is *no effect* if the interval contains zero and two one-sided
 tests (5% each; Schuirmann, 1987) reject differences beyond the margin. A claim of no effect is
 supported if these tests do so, and contradicted if the interval lies outside the margin. Otherwise
-the verdict is *undecided*: there are too few seeds, or they differ too much. Cells got more seeds
-where trainings failed. So if a side has failures, its interval also contains the one with the same
-number of seeds in all of its cells. A claim with several comparisons has the verdict of the worst
-comparison.
+the verdict is *undecided*: there are too few seeds, or they differ too much. Only cells that
+undecided comparisons needed got more seeds, and rare failures show mostly in these. So if a side
+has failures, its interval also contains the one with the same number of seeds in all of its cells.
+A claim with several comparisons has the verdict of the worst comparison.
 
 The values are returns for the rover, and normalised returns of the current settings for the
 pendulum, as means over the window lengths that all sides of a comparison have. The trainings of a

@@ -97,7 +97,7 @@ class Effect:
     def even(self) -> "Effect":
         """The effect with the first seeds of each cell: as many as the smallest cell of its side.
 
-        Cells got more seeds where trainings failed. If one training in ten fails, six of ten cells
+        Only some cells got more seeds. If one training in ten fails, six of ten cells
         with five seeds show no failure, and their variance does not tell that they may have some.
         Then a mean over cells with different numbers of seeds is less certain than its interval
         says. With the seeds that were planned for all cells, failures count as often as they occur;

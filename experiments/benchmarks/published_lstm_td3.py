@@ -8,7 +8,7 @@ random steps first instead of 10,000, because there are 30,000 steps; windows of
 command line; and past actions as inputs, as in its paper. Its imports of gym, PyBullet and its
 logger are replaced, because they do not install today. Like
 experiments/benchmarks/recurrent_ppo.py, the script trains three seeds and tests the final policy on
-100 episodes; it needs torch, pandas and 'gymnasium[mujoco]'. It writes
+100 episodes; it needs torch, pandas, jax and 'gymnasium[mujoco]'. It writes
 experiments/results/benchmarks/published_lstm_td3.csv: a row per seed. A seed that has a row is not
 trained again.
 """

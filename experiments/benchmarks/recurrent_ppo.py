@@ -5,7 +5,7 @@ Usage: python -m experiments.benchmarks.recurrent_ppo [--quick] [--out FILE]
 `MlpLstmPolicy` with the package's defaults, as its documentation uses it: 30,000 steps, three
 seeds, the final deterministic policy tested on 100 episodes, as
 experiments/gymnasium_simulators.py tests the agents of this package. sb3-contrib is not a
-dependency; it needs an environment of its own: `pip install sb3-contrib pandas
+dependency; it needs an environment of its own: `pip install sb3-contrib pandas jax
 'gymnasium[mujoco]'`. The script writes experiments/results/benchmarks/recurrent_ppo.csv: a row per
 seed. A seed that has a row is not trained again.
 """

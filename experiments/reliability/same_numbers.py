@@ -3,8 +3,8 @@
 Usage: python experiments/reliability/same_numbers.py OTHER [--quick] [--env rover] [--agents A ...]
 
 OTHER is the directory of another checkout, for example of `git worktree add /tmp/other COMMIT`.
-Each checkout trains the agents in its own process, with the settings of the preset `quick` and
-fewer steps. Then the learning curves and all parameters of the actors are compared. Agents act in
+Each checkout trains the agents in its own process, with the default settings, small networks and
+few steps. Then the learning curves and all parameters of the actors are compared. Agents act in
 half ranges since version 0.2, so only environments whose actions are within 1, such as the rover,
 give the same results before and after this version.
 """
