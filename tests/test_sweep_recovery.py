@@ -64,7 +64,6 @@ def cached():
 
 @contextlib.contextmanager
 def one_step_chunks(monkeypatch):
-    from rtd3jax.training import lanes
 
     with monkeypatch.context() as patch:
         patch.setattr(lanes, "_FIRST_CHUNK", 40)
@@ -196,9 +195,14 @@ def test_one_worker_finishes_what_two_began(whole, tmp_path, monkeypatch):
     with one_step_chunks(monkeypatch) as patch:
         patch.setattr(recorder.Recorder, "update", interrupt)
         assert run(out) == 130
-    one = workers()[:1]
-    monkeypatch.setattr(lanes, "workers", lambda: one)
+    one, used = workers()[:1], []
+    real = execute.advance_groups
+    monkeypatch.setattr(execute, "workers", lambda: one)
+    monkeypatch.setattr(
+        execute, "advance_groups", lambda *rest: (used.append(rest[-1]), real(*rest))
+    )
     assert run(out) == 0
+    assert used == [one]
     assert contents(out) == contents(whole)
 
 
@@ -290,7 +294,7 @@ def test_tables_wait_for_another_shards_tables(whole, tmp_path, monkeypatch):
         ({"seeds": [-1]}, "not a study's configuration"),
         ({"final_episodes": "many"}, "not a study's configuration"),
         ({"cells": [{"env": "../..", "disturbance": "../../x"}]}, None),
-        ({"cells": [{"env": "rover", "disturbance": "none", "import": "os"}]}, "not a study's"),
+        ({"cells": [{"env": "rover", "disturbance": "none", "import": "os"}]}, "field 'import'"),
         ({"cells": "rover"}, "not a study's configuration"),
     ],
 )
@@ -329,6 +333,7 @@ def test_links_that_lead_outside_are_refused(tmp_path, capsys):
     assert run(out) == 0
     for file in out.glob("lanes/**/*.safetensors"):
         file.unlink()
+    shutil.rmtree(out / "checkpoints")
     (out / "checkpoints").symlink_to(outside)
     assert run(out) != 0
     assert "leads outside" in capsys.readouterr().err

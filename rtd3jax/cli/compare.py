@@ -12,7 +12,7 @@ from rtd3jax.cli.common import add_import, exit_status, out_path, replace_unprin
 from rtd3jax.errors import UserError
 from rtd3jax.study.comparison import MEASURES, compare_runs, comparison_markdown, differing_settings
 from rtd3jax.study.rundir import RunDirectory
-from rtd3jax.system.files import write_bytes_atomically
+from rtd3jax.system.files import write_bytes_atomically, write_text_atomically
 from rtd3jax.system.imports import import_modules
 
 
@@ -28,7 +28,8 @@ def _run(options: argparse.Namespace) -> int:
     if out is not None and out.exists() and not out.is_dir():
         raise UserError(f"{out} is a file: --out must name a directory")
     directories = [RunDirectory.open(run) for run in options.runs]
-    names = _short_names([str(directory.path.resolve()) for directory in directories])
+    paths = [str(directory.path.resolve()) for directory in directories]
+    names = [_as_text(name) for name in _short_names(paths)]
     measure = MEASURES[options.true_return]
     table = compare_runs(directories, names, measure)
     settings = differing_settings(directories, names, table)
@@ -36,9 +37,17 @@ def _run(options: argparse.Namespace) -> int:
     print(text, end="")
     if out is not None:
         write_bytes_atomically(out / "compare.parquet", table.to_parquet(index=False))
-        write_bytes_atomically(out / "compare.md", text.encode())
+        write_text_atomically(out / "compare.md", text)
         print(f"\nresults: {out / 'compare.parquet'}, {out / 'compare.md'}")
     return 0
+
+
+def _as_text(name: str) -> str:
+    r"""The name, with escapes such as ``\udcff`` for bytes that are not text.
+
+    Parquet files contain only text, and the escapes keep different names different.
+    """
+    return name.encode("utf-8", "backslashreplace").decode()
 
 
 def _short_names(paths: list[str]) -> list[str]:

@@ -23,6 +23,7 @@ from rtd3jax.study.cells import make_cells
 from rtd3jax.study.cluster import check_absolute_starts, train_on_cluster
 from rtd3jax.study.execute import Work, train_here, waiting_jobs
 from rtd3jax.study.hosts import own_shard, own_share, relaunch
+from rtd3jax.study.lane_files import check_names
 from rtd3jax.study.lock import parse_shard, writer
 from rtd3jax.study.loggers import check_loggers
 from rtd3jax.study.memory_plan import lanes_at_once, usable_memory
@@ -121,8 +122,10 @@ def _plan(options: argparse.Namespace) -> _Plan:
         )
     out = sweep_options.out(options)
     directory = RunDirectory(out, cells, seeds, episodes)
-    if options.fresh and holds_study(out):
-        check_starts_stay(cells, out)
+    if options.fresh:
+        check_names(cells)  # `plan` checks them otherwise
+        if holds_study(out):
+            check_starts_stay(cells, out)
     if options.cluster:
         check_absolute_starts(cells)
     additions = "" if options.fresh else directory.plan()

@@ -10,9 +10,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from rtd3jax.config import Config
 from rtd3jax.errors import UserError
 from rtd3jax.registries import AGENTS, MEMORIES
 from rtd3jax.study.cells import Cell, cell_jobs
+from rtd3jax.system.versions import versions_of
 from rtd3jax.training.arguments import check_seeds
 from rtd3jax.training.jobs import Job
 from rtd3jax.training.lane_identity import LONGER
@@ -53,18 +55,36 @@ class Contents:
         Raises:
             UserError: when there is no such file, or it is not a study's.
         """
-        study = read_config(config)["study"]
+        content = read_config(config)
+        study = content["study"]
         try:
             for cell in study["cells"]:
+                _check_fields(config, dict(cell), content)
                 _check_registered(config, dict(cell))
             cells = tuple(Cell.from_dict(dict(cell)) for cell in study["cells"])
             seeds, episodes = check_seeds(study["seeds"]), int(study["final_episodes"])
             stages = tuple(int(count) for count in study.get("stages", ()))
-        except _NotRegistered:
+        except _Unknown:
             raise
+        except UserError as error:  # an impossible value
+            raise UserError(f"{config} is not a study's configuration: {error}") from error
         except (KeyError, TypeError, ValueError) as error:
             raise UserError(f"{config} is not a study's configuration") from error
         return cls(cells, seeds, episodes, stages)
+
+    def check_cell(self, path: Path, cell: Cell) -> None:
+        """Raise UserError unless the study in ``path`` has this cell, with the same settings."""
+        own = next((one for one in self.cells if one.key == cell.key), None)
+        if own is None:
+            raise UserError(f"{path} has no cell {cell.words}, only {_words_of(self.cells)}")
+        there, here = own.to_dict(), cell.to_dict()
+        longer = there["total_steps"] != here["total_steps"]  # the lane's file states its steps
+        for name in there:
+            if there[name] != here[name] and not (longer and name in LONGER):
+                raise UserError(
+                    f"{path} has {cell.words} with another {name} ({there[name]} there, "
+                    f"{here[name]} here): pass the cell as the study has it"
+                )
 
     def jobs(self, strategy: str) -> list[Job]:
         """A job for each lane; see `cell_jobs`."""
@@ -79,15 +99,36 @@ class Contents:
         return extended(self, asked) != self
 
 
-class _NotRegistered(UserError):
-    """The study has agents or memories that are not registered in this process."""
+class _Unknown(UserError):
+    """The study has fields, agents or memories that are not known in this process."""
+
+
+def _check_fields(config: Path, cell: dict[str, Any], content: dict[str, Any]) -> None:
+    """Raise UserError if the cell has a field that this version of the package does not have."""
+    known = {"env", "disturbance", *(field.name for field in dataclasses.fields(Config))}
+    for name in cell:
+        if name not in known:
+            raise _Unknown(
+                f"{config}: this version of rtd3jax ({versions_of(['rtd3jax'])['rtd3jax']}) does "
+                f"not know the field {name!r}{_writer_of(content)}"
+            )
+
+
+def _writer_of(content: dict[str, Any]) -> str:
+    """The version that wrote a configuration last, in words; empty if it is not stated."""
+    try:
+        last = [content, *content.get("grown", [])][-1]
+        version = str(last["made_with"]["versions"]["rtd3jax"])
+    except (KeyError, TypeError, AttributeError):
+        return ""
+    return f"; version {version} wrote it: install that version"
 
 
 def _check_registered(config: Path, cell: dict[str, Any]) -> None:
     for field, known in (("algorithm", AGENTS), ("memory", MEMORIES)):
         name = cell.get(field)
         if isinstance(name, str) and name not in known:
-            raise _NotRegistered(
+            raise _Unknown(
                 f"{config}: {field} {name!r} is not known here, only {', '.join(known)}; register "
                 "it before you open the study, or name its module with --import"
             )
@@ -182,6 +223,10 @@ def _own(cell: Cell) -> Mapping[str, Any]:
     """The configuration without the fields that identify the cell."""
     names = {"replay_capacity", *cell.key}  # its default is total_steps
     return {n: value for n, value in cell.config.to_dict().items() if n not in names}
+
+
+def _words_of(cells: Sequence[Cell]) -> str:
+    return _listed([cell.words for cell in cells])
 
 
 def _listed(words: Sequence[str]) -> str:

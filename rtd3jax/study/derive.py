@@ -3,6 +3,7 @@
 So the result does not depend on the order in which lanes ended, and can be repeated at any time.
 """
 
+import contextlib
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -16,7 +17,7 @@ from rtd3jax.study.results import REFERENCE_SEED, read_table, write_table
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.summary import summary_markdown
 from rtd3jax.study.tables import SCHEMAS, rows_of_lanes
-from rtd3jax.system.files import write_bytes_atomically
+from rtd3jax.system.files import write_text_atomically
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,6 +37,7 @@ def derive(
     *,
     wait: bool = True,
     pictures: bool = True,
+    locked: bool = False,
 ) -> None:
     """Write tables, figures and the summary of the lanes that have ended.
 
@@ -44,13 +46,14 @@ def derive(
         references: policies that need no training.
         wait: whether to wait while another process writes them.
         pictures: whether to draw the figures.
+        locked: whether the caller holds the lock `deriver` already.
 
     Raises:
         UserError: when the file of a lane is damaged.
         BlockingIOError: when another process writes them now, and ``wait`` is false.
     """
     # If shards end together, the last one that holds the lock reads the lanes of all.
-    with deriver(directory.path, wait):
+    with contextlib.nullcontext() if locked else deriver(directory.path, wait):
         _derive(directory, references, pictures)
 
 
@@ -67,7 +70,7 @@ def _derive(directory: RunDirectory, references: Iterable[Reference], pictures: 
     curves, episodes = tables["curves"], tables["episodes"]
     planned = {tuple(cell.key.values()): directory.seeds for cell in directory.cells}
     text = summary_markdown(_excerpt(directory), planned, episodes, rows.failures, best)
-    write_bytes_atomically(directory.path / "summary.md", text.encode())
+    write_text_atomically(directory.path / "summary.md", text)
     if pictures:
         learning_curves(curves, episodes, directory.path, best)
         final_returns(episodes, directory.path, best)

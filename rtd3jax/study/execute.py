@@ -9,6 +9,7 @@ import jax
 from rtd3jax.study.cells import bar_labels
 from rtd3jax.study.derive import Reference
 from rtd3jax.study.interim import InterimResults
+from rtd3jax.study.log import LoggedReturns
 from rtd3jax.study.loggers import Logger
 from rtd3jax.study.memory_plan import lanes_in_total
 from rtd3jax.study.recorder import Recorder
@@ -60,13 +61,18 @@ def train_here(
     references: Sequence[Reference] | None = None,
     logger: Logger | None = None,
     watch: Callable[[Group], None] = lambda group: None,
+    logged: LoggedReturns | None = None,
 ) -> None:
     """Train the lanes that have not ended; add a line to ``complaints`` for each that fails.
 
     With ``references``, tables and page are updated about once a minute. ``watch`` is called after
     each chunk is recorded; if it raises KeyboardInterrupt, the lanes write their checkpoints.
+    A process that trains lanes several times passes the same ``logged`` each time, so that it reads
+    each line of the log once.
     """
     waiting = waiting_jobs(directory, jobs)
+    checkpoints = checkpoints_of(directory, work.interval)
+    prepare_files(directory, waiting, checkpoints)
     add_starts(directory, waiting, write=True)
     forget_errors(directory, waiting)
     devices = workers()[: work.workers]
@@ -74,11 +80,17 @@ def train_here(
     if in_total < len(waiting) and not work.quiet:
         each = " of each device" if in_total > work.at_once else ""
         print(f"the memory is enough for {work.at_once:,} lanes{each}: the others wait")
-    checkpoints = checkpoints_of(directory, work.interval)
     groups = make_groups(waiting, work.strategy, len(devices), work.at_once, checkpoints)
     interim = None if references is None else InterimResults(directory, references, page=work.page)
     recorder = Recorder(
-        directory, checkpoints, interim, logger, complaints, keep=work.keep, began=work.began
+        directory,
+        checkpoints,
+        interim,
+        logger,
+        complaints,
+        keep=work.keep,
+        began=work.began,
+        logged=logged,
     )
     with Progress(groups, bar_labels(waiting), enabled=not work.quiet) as bar:
 
@@ -96,6 +108,17 @@ def waiting_jobs(directory: RunDirectory, jobs: Sequence[Job]) -> list[Job]:
     if len(waiting) < len(jobs):
         print(f"{len(jobs) - len(waiting)} of {len(jobs)} lanes have ended already")
     return waiting
+
+
+def prepare_files(directory: RunDirectory, jobs: Sequence[Job], checkpoints: Checkpoints) -> None:
+    """Make the directories of the lanes' files and checkpoints, before hours of training.
+
+    Raises:
+        UserError: when one of them cannot be written.
+    """
+    for job in jobs:
+        directory.lanes.prepare(*job.key)
+    checkpoints.prepare(jobs)
 
 
 def forget_errors(directory: RunDirectory, jobs: Iterable[Job]) -> None:

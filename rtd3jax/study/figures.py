@@ -21,7 +21,7 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 from rtd3jax.evaluation.style import STYLE
 from rtd3jax.study.colours import colour_of, ordered
 from rtd3jax.study.results import is_trained, reference_names
-from rtd3jax.study.statistics import iqm_bands, reference_mean, seed_means, summarise
+from rtd3jax.study.statistics import iqm_bands, reference_mean, seed_means, summarise, thinned
 from rtd3jax.system.files import write_bytes_atomically
 
 REFERENCE_COLOUR = "#777777"
@@ -170,9 +170,10 @@ def _curve_row(
 def _band(line: pd.DataFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Steps, IQM over seeds, and the bounds of its interval, [evaluations] each.
 
-    Steps without values are left out. For a single seed, the bounds equal its value.
+    Steps without values are left out, and so are most of very many steps (`thinned`). For a single
+    seed, the bounds equal its value.
     """
-    table = line.pivot(index="seed", columns="step", values="return")
+    table = thinned(line.pivot(index="seed", columns="step", values="return"))
     count, iqm, low, high = iqm_bands(table.to_numpy(np.float64))
     steps, seen = table.columns.to_numpy(), count > 0
     low, high = (np.where(count > 1, bound, iqm) for bound in (low, high))

@@ -21,7 +21,8 @@ except ImportError:
     _msvcrt = None  # type: ignore[assignment]
 
 msvcrt: Any = _msvcrt
-NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
+# On macOS, ENOTSUP and EOPNOTSUPP are two numbers; on Linux they are one.
+NO_LOCKS = tuple({errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP})
 _SHARERS = 1024
 """On Windows, number of bytes: a shared lock locks one of them, an exclusive lock all."""
 

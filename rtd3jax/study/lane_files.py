@@ -7,6 +7,7 @@ derived from these files.
 
 import hashlib
 import re
+import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,11 @@ from rtd3jax.errors import UserError
 from rtd3jax.policies.serialization import read_interface, restore_policy, under_prefix
 from rtd3jax.policies.trained import FORMAT, Policy
 from rtd3jax.study.cells import Cell
-from rtd3jax.system.files import read_arrays, read_metadata, write_arrays, write_bytes_atomically
+from rtd3jax.system.files import read_arrays, read_metadata, write_arrays, write_text_atomically
+
+MOST_LETTERS = 220
+"""Maximum length of a cell's name. File systems allow names of 255 bytes, and other files have
+longer names with the same parts: ``.robustness_<name>.png.<random>.tmp``."""
 
 
 class LaneFiles:
@@ -53,6 +58,19 @@ class LaneFiles:
         if not path.resolve().is_relative_to(self.path.resolve()):
             raise UserError(f"{path} leads outside {self.path}; remove the link")
         return path
+
+    def prepare(self, cell: Cell, seed: int) -> None:
+        """Make the directory of a lane's file, and raise UserError if it cannot be written."""
+        directory = self.lane_path(cell, seed).parent
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=directory):
+                pass
+        except OSError as error:
+            raise UserError(
+                f"{directory} cannot be written: {error.strerror}; lanes are trained only where "
+                "their files can be written"
+            ) from error
 
     def error_path(self, cell: Cell, seed: int) -> Path:
         """The file with the reason why a lane could not be trained."""
@@ -152,24 +170,38 @@ class LaneFiles:
 
     def write_start(self, cell: Cell, seed: int, what: str) -> None:
         """Write the name of the networks from which a lane starts."""
-        write_bytes_atomically(self.start_path(cell, seed), (what + "\n").encode())
+        write_text_atomically(self.start_path(cell, seed), what + "\n")
 
     def write_error(self, cell: Cell, seed: int, reason: str) -> None:
         """Write the reason why a lane could not be trained."""
-        write_bytes_atomically(self.error_path(cell, seed), (reason + "\n").encode())
+        write_text_atomically(self.error_path(cell, seed), reason + "\n")
 
 
-def check_names(cells: Iterable[Cell]) -> None:
-    """Raise UserError if two cells have the same directory name."""
+def check_names(cells: Iterable[Cell], there: int = 0) -> None:
+    """Raise UserError if the directory name of a cell is too long, or two cells have the same one.
+
+    Names that differ only in case are the same on macOS and Windows. The first ``there`` cells have
+    files already: their names are only compared with those of the other cells.
+    """
     names: dict[str, Cell] = {}
-    for cell in cells:
-        other = names.setdefault(cell_name(cell), cell)
+    for index, cell in enumerate(cells):
+        name = cell_name(cell)
+        if index < there:
+            names[name.casefold()] = cell
+            continue
+        if len(name) > MOST_LETTERS:
+            raise UserError(
+                f"the directory name of {cell.words} would have {len(name)} letters, of which "
+                f"{MOST_LETTERS} are allowed: register the disturbance under a short name "
+                "(rtd.register), and use this name"
+            )
+        other = names.setdefault(name.casefold(), cell)
         if other.key != cell.key:
             before, after = (" ".join(map(str, one.key.values())) for one in (other, cell))
+            case = "" if cell_name(other) == name else " but for upper and lower case"
             raise UserError(
-                f"the files of {before} and of {after} would have the same name, "
-                f"{cell_name(cell)}: rename an environment or a disturbance, or put them in "
-                "separate studies"
+                f"the files of {before} and of {after} would have the same name{case}, {name}: "
+                "rename an environment or a disturbance, or put them in separate studies"
             )
 
 

@@ -1,6 +1,7 @@
 """The log of a study: a JSON row for each evaluation of each lane, written during training."""
 
 import json
+import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -23,15 +24,41 @@ def append_rows(path: Path, rows: Iterable[dict[str, Any]]) -> None:
                 written += log.write(data[written:])
 
 
-def repair_log(path: Path) -> dict[tuple[Any, ...], Any]:
-    """End an incomplete last line; return the last logged return by lane and step.
-
-    A key is the lane as in `lane_of`, followed by the step.
-    """
-    if path.exists() and not path.read_bytes().endswith(b"\n"):
+def repair_log(path: Path) -> None:
+    """End an incomplete last line, which a killed process has left."""
+    if not path.exists() or path.stat().st_size == 0:
+        return
+    with path.open("rb") as file:
+        file.seek(-1, os.SEEK_END)
+        ended = file.read() == b"\n"
+    if not ended:
         with path.open("a", encoding="utf-8") as file:
             file.write("\n")
-    return {(*lane_of(row), row["step"]): row.get("return") for row in read_log(path)}
+
+
+class LoggedReturns:
+    """The returns in a log that grows, each line of which is read once."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._offset = 0
+        self._returns: dict[tuple[Any, ...], Any] = {}
+
+    def update(self) -> dict[tuple[Any, ...], Any]:
+        """Repair the log; return the last return by lane and step, as the log has them now.
+
+        A key is the lane as in `lane_of`, followed by the step.
+        """
+        repair_log(self._path)
+        if self._path.exists():
+            with self._path.open("rb") as file:
+                file.seek(self._offset)
+                new = file.read()
+            new = new[: new.rfind(b"\n") + 1]
+            self._offset += len(new)
+            for row in parse_log(new.decode("utf-8", "replace")):
+                self._returns[*lane_of(row), row["step"]] = row.get("return")
+        return self._returns
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:

@@ -167,8 +167,7 @@ class MLflow(PerLane[str]):
         store = f"sqlite:///{(directory.path / 'mlflow.db').resolve()}"
         self._client = mlflow.MlflowClient(os.environ.get("MLFLOW_TRACKING_URI", store))
         name = directory.path.resolve().name
-        found = self._client.get_experiment_by_name(name)
-        self._experiment = found.experiment_id if found else self._client.create_experiment(name)
+        self._experiment = _experiment(self._client, name)
 
     def _begin(self, cell: Cell, seed: int) -> str:
         lane = _lane_id(self._study, cell_name(cell), seed)
@@ -268,7 +267,21 @@ def open_loggers(names: Sequence[str], directory: RunDirectory) -> Iterator[Logg
         logger.close()
 
 
+def _experiment(client: Any, name: str) -> str:
+    """The id of MLflow's experiment of this name, which is created if there is none."""
+    if found := client.get_experiment_by_name(name):
+        return found.experiment_id
+    try:
+        return client.create_experiment(name)
+    except Exception:
+        # Another shard may have created it since the look.
+        if found := client.get_experiment_by_name(name):
+            return found.experiment_id
+        raise
+
+
 def _lane_id(study: str, cell: str, seed: int) -> str:
     """The unique id of a lane, the same after each restart of its study."""
     text = f"{study}\n{cell}\n{seed}"
-    return hashlib.sha256(text.encode()).hexdigest()[:24]
+    # The path of the study may contain bytes that are not text.
+    return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()[:24]

@@ -20,7 +20,13 @@ from rtd3jax.errors import UserError
 from rtd3jax.study.cells import bar_labels
 from rtd3jax.study.crew import Crew, Member
 from rtd3jax.study.derive import Reference
-from rtd3jax.study.execute import Work, forget_errors, waiting_jobs
+from rtd3jax.study.execute import (
+    Work,
+    checkpoints_of,
+    forget_errors,
+    prepare_files,
+    waiting_jobs,
+)
 from rtd3jax.study.interim import InterimResults
 from rtd3jax.study.log import LOG, repair_log
 from rtd3jax.study.log_reader import LogReader
@@ -69,6 +75,7 @@ def train_in_processes(
     waiting = waiting_jobs(directory, jobs)
     if not waiting:
         return
+    prepare_files(directory, waiting, checkpoints_of(directory, work.interval))
     forget_errors(directory, waiting)
     repair_log(directory.path / LOG)
     inner = dataclasses.replace(work, quiet=True, at_once=shares.lanes, began=time.perf_counter())

@@ -8,7 +8,7 @@ import numpy as np
 from rtd3jax.errors import short_reason
 from rtd3jax.evaluation.returns import both_returns
 from rtd3jax.study.interim import InterimResults
-from rtd3jax.study.log import LOG, append_rows, repair_log
+from rtd3jax.study.log import LOG, LoggedReturns, append_rows
 from rtd3jax.study.loggers import Logger
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.training.checkpoint import Checkpoints
@@ -31,12 +31,14 @@ class Recorder:
         *,
         keep: bool = False,
         began: float | None = None,
+        logged: LoggedReturns | None = None,
     ):
         """Create the recorder.
 
         Without ``interim``, another process updates the tables and the page. With ``keep``, the
         last checkpoint of a lane is kept when the lane ends. ``began`` is the value of
-        `time.perf_counter` from which the log counts seconds; now by default.
+        `time.perf_counter` from which the log counts seconds; now by default. ``logged`` are the
+        returns in the log that an earlier recorder has read, if there was one.
         """
         self._directory = directory
         self._checkpoints = checkpoints
@@ -44,7 +46,7 @@ class Recorder:
         self._logger = logger
         self._logged: dict[int, int] = {}
         self._failed: set[int] = set()
-        self._there = repair_log(directory.path / LOG)
+        self._there = (logged or LoggedReturns(directory.path / LOG)).update()
         self._began = time.perf_counter() if began is None else began
         self._complaints = complaints
         self._keep_checkpoints = keep

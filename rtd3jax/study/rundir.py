@@ -130,7 +130,7 @@ class RunDirectory:
         self._check_longer(there)
         self._check_format(config)
         if self.contents != there:
-            check_names(self.cells)
+            check_names(self.cells, len(there.cells))
             news.append(f"added to {self.path}: {additions_text(there, self.contents)}")
         elif extended(self._asked, there) != self._asked:
             news.append(

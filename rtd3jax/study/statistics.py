@@ -24,6 +24,10 @@ TRIM = 0.25  # fraction of seeds cut from each side for the IQM
 CONFIDENCE = 0.95
 RESAMPLES = 2_000
 BOOTSTRAP_SEED = 0  # fixed: the same results always give the same interval
+MOST_POINTS = 200
+"""Maximum number of points of a curve in figures and on the page: others would cost seconds."""
+_BLOCK = 64
+"""Number of points whose resamples are in memory at the same time."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +89,7 @@ def iqm_bands(values: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray, np
     array = np.asarray(values, np.float64)
     finite = np.isfinite(array)
     iqm, low, high = (np.full(array.shape[1], np.nan) for _ in range(3))
-    # Points with the same seeds share one set of resamples.
+    # Points with the same seeds share one set of resamples, which does not depend on the block.
     patterns, which = np.unique(finite, axis=1, return_inverse=True)
     for index in range(patterns.shape[1]):
         points = np.flatnonzero(which.ravel() == index)
@@ -93,8 +97,18 @@ def iqm_bands(values: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray, np
         if kept.shape[0] >= 1:
             iqm[points] = _iqm(kept, axis=0)
         if kept.shape[0] >= 2:
-            low[points], high[points] = _bootstrap_interval(kept)
+            for start in range(0, points.size, _BLOCK):  # all at once need 500 MiB for 1,000 points
+                block = slice(start, start + _BLOCK)
+                low[points[block]], high[points[block]] = _bootstrap_interval(kept[:, block])
     return finite.sum(axis=0), iqm, low, high
+
+
+def thinned(table: pd.DataFrame) -> pd.DataFrame:
+    """The table with at most `MOST_POINTS` columns, evenly spaced, with the first and the last."""
+    if table.shape[1] <= MOST_POINTS:
+        return table
+    points = np.linspace(0, table.shape[1] - 1, MOST_POINTS).round().astype(int)
+    return table.iloc[:, np.unique(points)]
 
 
 def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> float:

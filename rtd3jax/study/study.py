@@ -157,8 +157,12 @@ class Study:
         """The trained policy of a lane.
 
         Raises:
-            UserError: when the lane has not ended, or was lost.
+            UserError: when the study has no such cell, or has it with other settings; when the lane
+                has not ended, or was lost.
         """
+        if not isinstance(cell, Cell):
+            raise UserError(f"a study consists of rtd.Cell, not {type(cell).__name__}")
+        self._directory.contents.check_cell(self.path, cell)
         return self._directory.lanes.policy(cell, seed)
 
 

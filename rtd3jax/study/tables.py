@@ -92,7 +92,8 @@ def current_tables(
 
     The rows are those of the Parquet files, and those of the lanes that ended after the files were
     written, because a sweep that is killed does not write its tables. Rows of a lane that is to be
-    trained to more steps are left out, as `rows_of_lanes` does. Nothing is written.
+    trained to more steps, and of one whose file was removed to train it again, are left out, as
+    `rows_of_lanes` does. Nothing is written.
 
     Args:
         directory: the run directory.
@@ -126,23 +127,31 @@ def current_tables(
 def _replaced_lanes(
     directory: RunDirectory, tables: dict[str, pd.DataFrame]
 ) -> list[tuple[Cell, int]]:
-    """The lanes with files that are not in the tables, are newer than these, or have too few steps.
+    """The lanes whose rows in the tables are not those of their files.
 
-    A file is newer if the lane was trained further, or again. It has too few steps if the study was
-    extended and the lane has not been trained further yet.
+    The file of such a lane is not in the tables, is newer than these, has too few steps, or was
+    removed. A file is newer if the lane was trained further, or again. It has too few steps if the
+    study was extended and the lane has not been trained further yet.
     """
     written = min(_written(directory, name) for name in SCHEMAS)
     # A sweep that is killed between two tables leaves some of them without its latest lanes.
     there = set.intersection(*map(_lanes_of, tables.values()))
+    partly = set.union(*map(_lanes_of, tables.values()))
+    # A copy of the tables alone has no file of any lane.
+    has_files = (directory.path / "lanes").is_dir()
     found = []
     for cell in directory.cells:
         for seed in directory.seeds:
-            path = directory.lanes.lane_path(cell, seed)
-            if path.exists() and (
-                (*cell.key.values(), seed) not in there
-                or path.stat().st_mtime_ns >= written
-                or not directory.lanes.is_done(cell, seed)
-            ):
+            path, lane = directory.lanes.lane_path(cell, seed), (*cell.key.values(), seed)
+            if path.exists():
+                replaced = (
+                    lane not in there
+                    or path.stat().st_mtime_ns >= written
+                    or not directory.lanes.is_done(cell, seed)
+                )
+            else:
+                replaced = has_files and lane in partly
+            if replaced:
                 found.append((cell, seed))
     return found
 

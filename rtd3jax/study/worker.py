@@ -60,6 +60,7 @@ def _work(answer: Answer) -> int:
 def _serve(settings: dict[str, Any], orders_from: IO[str], answer: Answer) -> None:
     from rtd3jax.study.cells import cell_jobs
     from rtd3jax.study.execute import Work, train_here
+    from rtd3jax.study.log import LOG, LoggedReturns
     from rtd3jax.study.rundir import RunDirectory
     from rtd3jax.system.imports import import_modules
     from rtd3jax.training.groups import Group
@@ -69,6 +70,7 @@ def _serve(settings: dict[str, Any], orders_from: IO[str], answer: Answer) -> No
     directory = RunDirectory.open(settings["path"])
     places = {cell: place for place, cell in enumerate(directory.cells)}
     work = Work(**settings["work"])
+    logged = LoggedReturns(directory.path / LOG)
     orders = _Orders(orders_from)
     known: dict[int, dict[int, Job]] = {}
 
@@ -92,7 +94,7 @@ def _serve(settings: dict[str, Any], orders_from: IO[str], answer: Answer) -> No
         complaints: list[str] = []
         jobs = [job(place, seed) for place, seed in order["lanes"]]
         try:
-            train_here(directory, jobs, work, complaints, watch=watch)
+            train_here(directory, jobs, work, complaints, watch=watch, logged=logged)
         except KeyboardInterrupt:
             break
         answer({"ended": complaints})

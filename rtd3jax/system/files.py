@@ -48,6 +48,14 @@ def write_bytes_atomically(path: str | os.PathLike, data: bytes) -> None:
         raise
 
 
+def write_text_atomically(path: str | os.PathLike, text: str) -> None:
+    """Put ``text`` at ``path`` as UTF-8, as `write_bytes_atomically` does.
+
+    A "?" replaces each byte of a path in ``text`` that is not text.
+    """
+    write_bytes_atomically(path, text.encode("utf-8", "replace"))
+
+
 def check_target(path: str | os.PathLike, overwrite: bool = False) -> Path:
     """``path``, if a file may be written there.
 

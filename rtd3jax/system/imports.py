@@ -1,5 +1,6 @@
 """Imports a user's modules by name, for the option ``--import``."""
 
+import contextlib
 import importlib
 import os
 import sys
@@ -18,7 +19,8 @@ def import_modules(modules: Sequence[str]) -> None:
         UserError: when a module cannot be imported.
     """
     for module in modules:
-        sys.path.insert(0, os.getcwd())
+        here = os.getcwd()
+        sys.path.insert(0, here)
         try:
             importlib.import_module(module)
         except (ImportError, TypeError, ValueError) as error:
@@ -26,4 +28,6 @@ def import_modules(modules: Sequence[str]) -> None:
             hint = f"; give a module's name: --import {name}" if name and name != module else ""
             raise UserError(f"--import {module or repr('')}: {error}{hint}") from error
         finally:
-            sys.path.pop(0)
+            # Not the first entry, which the module may have put there itself.
+            with contextlib.suppress(ValueError):
+                sys.path.remove(here)

@@ -101,6 +101,14 @@ def test_the_band_is_the_interval_of_the_iqm_and_no_better_than_any_seed(tmp_pat
     assert max(at_start) <= -146.0 and min(at_start) < -1_000.0
 
 
+def test_a_curve_of_very_many_evaluations_is_thinned(tmp_path, drawn):
+    rows, _ = cell(seeds=1)
+    curves = pd.DataFrame([{**rows[0], "step": step, "return": -step / 10} for step in range(999)])
+    figures.learning_curves(curves, None, tmp_path)
+    steps = line(drawn[0].axes[0], "td3").get_xdata()
+    assert (len(steps), steps[0], steps[-1]) == (200, 0, 998)
+
+
 def test_a_lost_seed_does_not_break_the_mean(tmp_path, drawn):
     curves, _ = tables(cell(seeds=2, level=-100.0))
     curves.loc[(curves["seed"] == 1) & (curves["step"] > 5000), "return"] = np.nan

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import runpy
 import warnings
 
 import pytest
@@ -78,6 +79,13 @@ def test_a_file_system_without_locks_is_a_warning(code, tmp_path, monkeypatch):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert not is_held(tmp_path)
+
+
+def test_the_error_of_macos_for_no_locks_is_known(monkeypatch):
+    """There, ENOTSUP and EOPNOTSUPP are two numbers."""
+    monkeypatch.setattr(errno, "ENOTSUP", 45)
+    monkeypatch.setattr(errno, "EOPNOTSUPP", 102)
+    assert {45, 102} <= set(runpy.run_path(filelock.__file__)["NO_LOCKS"])
 
 
 @pytest.mark.parametrize("system", ["here", "windows"])

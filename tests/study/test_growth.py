@@ -16,6 +16,7 @@ from rtd3jax.study.contents import Contents
 from rtd3jax.study.lane_files import cell_name
 from rtd3jax.study.lock import writer
 from rtd3jax.study.rundir import RunDirectory
+from rtd3jax.system.files import write_bytes_atomically
 
 SETTINGS = dict(hidden_size=4, batch_size=4, learning_starts=10, eval_every=30, eval_episodes=1)
 FLAGS = [f"--{name.replace('_', '-')}={value}" for name, value in SETTINGS.items()]
@@ -208,7 +209,8 @@ def test_a_study_grows_only_while_no_one_writes_to_it(tmp_path, monkeypatch):
         content = json.loads(before)
         content["study"]["seeds"] = [0, 1]
         monkeypatch.setattr(rundir, "_PATIENCE", 10)
-        thread = threading.Timer(0.2, (tmp_path / "config.json").write_text, [json.dumps(content)])
+        grown = tmp_path / "config.json", json.dumps(content).encode()
+        thread = threading.Timer(0.2, write_bytes_atomically, grown)
         thread.start()
         assert _directory(tmp_path, seeds=(0, 1)).seeds == [0, 1]
         thread.join()

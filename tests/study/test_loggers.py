@@ -1,6 +1,7 @@
 """Tests that each tracker gets every evaluation of every lane, without a network."""
 
 import struct
+import types
 
 import pytest
 
@@ -64,6 +65,33 @@ def test_mlflow_goes_on_in_the_run_of_a_lane(directory):
         losses = client.get_metric_history(one.info.run_id, LOSS)
         assert [(p.step, p.value) for p in losses] == [(20, 7.0), (60, 2.5)]
         assert one.data.params["env"] == "rover"
+
+
+class FakeMlflow:
+    """A store in which another shard creates the experiment at the same moment."""
+
+    def __init__(self, reason):
+        self.found, self.reason = None, reason
+
+    def MlflowClient(self, store):  # noqa: N802
+        return self
+
+    def get_experiment_by_name(self, name):
+        return self.found
+
+    def create_experiment(self, name):
+        if self.reason == "already exists":
+            self.found = types.SimpleNamespace(experiment_id="7")
+        raise OSError(self.reason)
+
+
+def test_shards_that_create_the_same_experiment_share_it(directory, monkeypatch):
+    fake = FakeMlflow("already exists")
+    monkeypatch.setattr(loggers.importlib, "import_module", lambda name: fake)
+    assert loggers.MLflow(directory)._experiment == "7"
+    fake = FakeMlflow("no space")
+    with pytest.raises(OSError, match="no space"):
+        loggers.MLflow(directory)
 
 
 def test_wandb_offline(directory, monkeypatch):

@@ -8,7 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtd3jax.study.statistics import probability_of_improvement, seed_means, summarise
+from rtd3jax.study import statistics
+from rtd3jax.study.statistics import (
+    iqm_bands,
+    probability_of_improvement,
+    seed_means,
+    summarise,
+)
 
 returns = st.floats(-1e4, 1e4, allow_nan=False)
 
@@ -144,6 +150,20 @@ def test_seed_means_do_not_lose_precision():
     # In float32 the running sum of these would stall.
     means = seed_means(episodes({0: [2.0**24] + [1.0] * 63}))
     assert means["return"].iloc[0] == (2.0**24 + 63) / 64
+
+
+def test_a_long_curve_is_resampled_in_blocks_with_the_same_bits(monkeypatch):
+    values = np.random.default_rng(3).normal(size=(3, 150))
+    values[0, 7], values[:2, 9], values[:, 11] = np.nan, np.nan, np.nan
+    real, sizes = statistics._bootstrap_interval, []
+    monkeypatch.setattr(
+        statistics, "_bootstrap_interval", lambda own: (sizes.append(own.shape[1]), real(own))[1]
+    )
+    found = iqm_bands(values)
+    assert max(sizes) == 64 and sum(sizes) == 148
+    monkeypatch.setattr(statistics, "_BLOCK", 1_000)
+    for one, other in zip(found, iqm_bands(values), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_probability_of_improvement_counts_pairs_and_half_ties():

@@ -1,15 +1,20 @@
 """Tests that `Study` writes the same files as the sweep."""
 
+import dataclasses
 import os
 import signal
 
 import pandas as pd
 import pytest
+from made_run import make_run
 
 import rtd3jax as rtd
 from rtd3jax import sweep
 from rtd3jax.cli import sweep as sweep_module
-from rtd3jax.study import recorder, run
+from rtd3jax.study import execute, process_plan, recorder, run
+from rtd3jax.study import processes as processes_module
+from rtd3jax.study.cells import Grid
+from rtd3jax.study.lane_files import check_names
 from rtd3jax.study.lock import is_held
 from rtd3jax.training import lanes
 
@@ -100,10 +105,73 @@ def test_a_cell_that_cannot_run_is_not_added(tmp_path):
 
 def test_cells_whose_files_would_have_one_name_are_refused(tmp_path):
     joined, foreign = (("a_b", "c"), ("a", "b_c")), (("rover", "風"), ("rover", "砂"))
-    for pair in (joined, foreign):
+    cases = ("rover", "Slip"), ("rover", "slip")  # one directory on macOS and Windows
+    for pair in (joined, foreign, cases):
         with pytest.raises(rtd.UserError, match="would have the same name"):
             rtd.Study([rtd.Cell(*two, rtd.Config("td3")) for two in pair], out=tmp_path / "study")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_cell_whose_directory_name_is_too_long_is_refused_before_anything_changes(
+    tmp_path, capsys
+):
+    long = rtd.Cell("rover", "/".join(["ar1-slip"] * 30), rtd.Config("td3"))
+    match = "directory name of rover ar1-slip/.* td3 would have 282 letters.*short name .rtd.reg"
+    with pytest.raises(rtd.UserError, match=match):
+        rtd.Study([long], out=tmp_path / "study")
+    assert not list(tmp_path.iterdir())
+    rtd.Study(_cells(), seeds=[0], out=tmp_path / "study")
+    command = ["--env", "rover", "--disturbances", long.disturbance, "--algorithms", "td3"]
+    assert sweep.main([*command, "--out", str(tmp_path / "study"), "--fresh"]) == 2
+    assert "would have 282 letters" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["study"]
+
+
+def test_names_that_an_existing_study_has_do_not_stop_its_growth():
+    cells = [rtd.Cell("rover", name, rtd.Config("td3")) for name in ("Slip", "slip", "SLIP")]
+    check_names(cells[:2], there=2)
+    with pytest.raises(rtd.UserError, match="same name but for upper and lower case"):
+        check_names(cells, there=2)
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+@pytest.mark.parametrize("name", ["lanes", "checkpoints"])
+def test_files_that_cannot_be_written_are_noticed_before_the_training(
+    name, processes, tmp_path, monkeypatch, capsys
+):
+    def refuse(*_, **__):
+        raise AssertionError("training began")
+
+    monkeypatch.setattr(execute, "advance_groups", refuse)
+    monkeypatch.setattr(processes_module, "Crew", refuse)
+    monkeypatch.setattr(process_plan, "cores", lambda: 2)
+    rtd.Study(_cells()[:1], seeds=[0, 1], out=tmp_path, final_episodes=2)
+    (tmp_path / name).write_text("")  # root may write to any directory, but not into a file
+    flags = [f"--{name.replace('_', '-')}={value}" for name, value in TINY.items()]
+    command = "--env rover --disturbances ar1-slip --algorithms td3 --history-lengths 2 --seeds 2"
+    command += f" --final-episodes 2 --no-report --processes {processes} --out {tmp_path}"
+    assert sweep.main([*command.split(), *flags]) == 2
+    error = capsys.readouterr().err
+    assert f"{tmp_path / name}" in error and "cannot be written" in error
+    assert error.count("\n") == 1
+
+
+def test_a_policy_of_a_cell_with_other_settings_is_refused(tmp_path):
+    run_of_td3 = make_run(tmp_path / "run", Grid("rover", ("ar1-slip",), ("td3",), (1,)))
+    (cell,) = run_of_td3.cells
+    study = rtd.Study([cell], seeds=[0, 1], out=run_of_td3.path, final_episodes=2)
+    assert study.policy(cell, 1).algorithm == "td3"
+    for field, value in (("gamma", 0.5), ("replay_capacity", 50)):
+        config = dataclasses.replace(cell.config, **{field: value})
+        with pytest.raises(rtd.UserError, match=f"rover ar1-slip td3 with another {field} "):
+            study.policy(dataclasses.replace(cell, config=config), 1)
+    with pytest.raises(rtd.UserError, match="no cell rover none td3, only rover ar1-slip td3"):
+        study.policy(dataclasses.replace(cell, disturbance="none"), 1)
+    longer = dataclasses.replace(cell.config, total_steps=90)
+    with pytest.raises(rtd.UserError, match="seed 1 is not trained yet"):
+        study.policy(dataclasses.replace(cell, config=longer), 1)
+    with pytest.raises(rtd.UserError, match="consists of rtd.Cell, not str"):
+        study.policy("td3", 1)
 
 
 @pytest.mark.parametrize("how", ["study", "sweep"])

@@ -1,6 +1,8 @@
 """Tests that tables hold all lanes that have ended, also after a sweep was killed."""
 
 import dataclasses
+import hashlib
+import io
 import os
 import shutil
 import sys
@@ -11,10 +13,11 @@ import pytest
 from made_run import STEPS, make_run
 
 import rtd3jax as rtd
-from rtd3jax import stress
+from rtd3jax import compare, stress
 from rtd3jax.study.cells import Grid
 from rtd3jax.study.comparison import compare_runs
 from rtd3jax.study.derive import derive
+from rtd3jax.study.loggers import _lane_id
 from rtd3jax.study.report.page import page_data, write_page
 from rtd3jax.study.results import key_columns
 from rtd3jax.study.rundir import RunDirectory
@@ -133,6 +136,24 @@ def test_a_lane_that_was_trained_again_replaces_its_rows(whole):
     assert changed == pytest.approx(2.0, abs=1e-5)  # two episodes
 
 
+@pytest.mark.parametrize("whole_cell", [False, True])
+def test_a_lane_whose_file_was_removed_to_train_it_again_has_no_rows(whole_cell, whole):
+    before = current_tables(whole)
+    cell = whole.cells[0]
+    path = whole.lanes.lane_path(cell, 1)
+    shutil.rmtree(path.parent) if whole_cell else path.unlink()
+    study = rtd.Study(whole.cells, seeds=whole.seeds, out=whole.path, final_episodes=2)
+    status = study.status()
+    assert (status["status"] == "planned").sum() == 1 + whole_cell
+    for name, table in study.tables().items():
+        trained = table[table["seed"] >= 0]
+        own = trained.loc[trained["algorithm"] == cell.config.algorithm, "seed"]
+        assert set(own) == (set() if whole_cell else {0})
+        references = len(before[name]) - (before[name]["seed"] >= 0).sum()
+        assert len(table) - len(trained) == references
+    page_data(whole, complete=False, playback=False)
+
+
 def test_tables_without_the_files_of_lanes_stay(whole, tmp_path):
     """A copy may have the tables only."""
     copy = tmp_path / "copy"
@@ -171,3 +192,26 @@ def test_the_name_of_a_run_may_be_bytes_that_are_not_text(tmp_path):
     assert "<title>run-?" in page.read_text("utf-8")
     assert stress.main([str(run.path), "--episodes", "1", "--stresses", "noise=0"]) == 0
     assert page_data(run, complete=False, playback=False)["robustness"]
+    other = make_run(
+        tmp_path / os.fsdecode(b"run-\xfe"), Grid("rover", ("ar1-slip",), ("td3",), (1,))
+    )
+    out = tmp_path / os.fsdecode(b"compared-\xff")
+    assert compare.main([str(run.path), str(other.path), "--out", str(out)]) == 0
+    table = pd.read_parquet(io.BytesIO((out / "compare.parquet").read_bytes()))
+    names = table["run"].tolist()
+    assert names == [r"run-\udcff", r"run-\udcfe"]
+    assert r"run-\udcfe" in (out / "compare.md").read_text("utf-8")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names are bytes only on Linux")
+def test_messages_and_ids_of_paths_that_are_not_text(whole, tmp_path):
+    path, cell = str(tmp_path / os.fsdecode(b"start-\xff")), whole.cells[0]
+    whole.lanes.write_error(cell, 0, f"{path} cannot be read")
+    assert whole.lanes.error(cell, 0).endswith("start-? cannot be read")
+    whole.lanes.write_start(cell, 0, f"policy {path}")
+    derive(whole, [], pictures=False)
+    assert "start-?" in (whole.path / "summary.md").read_text("utf-8")
+    ids = {_lane_id(name, "cell", 0) for name in (path, path[:-1], f"{path}2")}
+    assert len(ids) == 3
+    # The ids of other paths are those of earlier versions: their trackers continue.
+    assert _lane_id("runs/a", "cell", 0) == hashlib.sha256(b"runs/a\ncell\n0").hexdigest()[:24]

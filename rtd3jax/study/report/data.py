@@ -22,11 +22,8 @@ from rtd3jax.study.colours import colour_of, ordered
 from rtd3jax.study.log import LOG, TASKS, lane_of, read_log, steps_reached
 from rtd3jax.study.results import CELL, is_trained, reference_names, rounded_number
 from rtd3jax.study.rundir import RunDirectory
-from rtd3jax.study.statistics import Summary, iqm_bands, reference_mean, summarise
+from rtd3jax.study.statistics import Summary, iqm_bands, reference_mean, summarise, thinned
 from rtd3jax.study.status import ledger
-
-MOST_POINTS = 200
-"""Maximum number of points of a learning curve; a longer curve is thinned evenly."""
 
 MEASURES = {"return": "as rewarded", "true_return": "of the true state"}
 
@@ -148,16 +145,13 @@ def _references(
 def curve_data(rows: pd.DataFrame, measure: str, along: str) -> dict[str, Any] | None:
     """IQM over the seeds with the bounds of its interval, at each value of the column ``along``.
 
-    The page calls these values "steps". Of more than `MOST_POINTS` values, this number is kept,
-    evenly spaced. The result is None without a finite value.
+    The page calls these values "steps". Of more than `rtd3jax.study.statistics.MOST_POINTS` values,
+    this number is kept, evenly spaced. The result is None without a finite value.
     """
     rows = rows[np.isfinite(rows[measure].astype(np.float64))]
     if rows.empty:
         return None
-    table = rows.pivot(index="seed", columns=along, values=measure)
-    if table.shape[1] > MOST_POINTS:
-        points = np.unique(np.linspace(0, table.shape[1] - 1, MOST_POINTS).round().astype(int))
-        table = table.iloc[:, points]
+    table = thinned(rows.pivot(index="seed", columns=along, values=measure))
     count, iqm, low, high = iqm_bands(table.to_numpy(np.float64))
     number = int if table.columns.dtype.kind in "iu" else rounded_number  # steps keep all digits
     return {
