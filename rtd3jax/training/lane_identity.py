@@ -1,6 +1,7 @@
-"""The identity of a lane, in its checkpoints and in its study: what determines its results.
+"""The identity of a lane, in its checkpoints: what determines its results.
 
-An identity is a JSON-ready dictionary with the fields of the configuration, the plant and the seed.
+An identity is a JSON-ready dictionary with the fields of the configuration, the seed, and what else
+the caller knows of the lane, such as its plant or its window.
 """
 
 import json

@@ -107,7 +107,7 @@ def _work(
 
 
 def _train(pool: Pool, device: jax.Device, checkpoints: Checkpoints | None) -> None:
-    """Run chunks of the group with the fewest steps, as long as there is a group."""
+    """Run a chunk of one group after the other, as long as the pool has a group."""
     rates: dict[Any, float] = {}
     while (group := pool.take(device)) is not None:
         try:

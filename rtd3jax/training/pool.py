@@ -1,6 +1,7 @@
 """The groups that the workers of a training share.
 
-Each worker takes the group with the fewest steps, so that five lanes keep two cores equally busy.
+Workers take one cell after the other, and within a cell the group with the fewest steps, so that
+five lanes keep two cores equally busy.
 """
 
 import threading
@@ -28,7 +29,7 @@ class Pool:
         self._changed = threading.Condition()
 
     def take(self, device: Any) -> Group | None:
-        """The idle group with the fewest steps; None if this worker will get no more groups.
+        """The idle group to advance next; None if this worker will get no more groups.
 
         A group whose state is on another device is only taken while that device is busy: to move
         it takes time, and memory for a second state.
