@@ -4,16 +4,21 @@ Usage: python experiments/from_a_log.py [LOG.csv] [--quick] [--out DIR]; see doc
 """
 
 import argparse
+import sys
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 import rtd3jax as rtd
+from rtd3jax.envs.log import read_episodes
 from rtd3jax.envs.rover import Rover, RoverParams
 from rtd3jax.envs.rover.registration import feedforward_pi
 from rtd3jax.envs.rover.slip import Ar1Slip
 from rtd3jax.study.presets import PRESETS
+
+SLOWEST = 0.05
+"""m/s: at a lower commanded speed, a wheel's slip is not known; such rows are gaps."""
 
 
 def drive(out: Path, episodes: int) -> Path:
@@ -29,7 +34,28 @@ def drive(out: Path, episodes: int) -> Path:
     return out / "log.csv"
 
 
+def slip_of(path: Path) -> rtd.Recorded:
+    """The slip of both wheels in a log of their speeds, an array with gaps for each episode."""
+    names = [f"{speed}_{side}" for speed in ("commanded", "realised") for side in ("left", "right")]
+    episodes = []
+    for stretches in read_episodes(path, columns=names):
+        rows = []
+        for commanded, realised in (np.split(part, 2, axis=1) for part in stretches):
+            moving = np.where(np.abs(commanded) < SLOWEST, np.nan, commanded)
+            rows += [1.0 - realised / moving, np.full((1, 2), np.nan)]
+        episodes.append(np.concatenate(rows))
+    # Noise of the encoders makes some slip negative.
+    return rtd.Recorded(episodes, channel="slip", bounds=(0.0, 1.0))
+
+
 def main(arguments: list[str] | None = None) -> None:
+    try:
+        from_a_log(arguments)
+    except rtd.UserError as error:
+        sys.exit(f"error: {error}")
+
+
+def from_a_log(arguments: list[str] | None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
         "log", nargs="?", type=Path, help="wheel speeds; by default a rover is simulated"
@@ -37,10 +63,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--quick", action="store_true", help="a tiny run to test the script")
     parser.add_argument("--out", type=Path, default=Path("runs/from_a_log"))
     (options := parser.parse_args(arguments)).out.mkdir(parents=True, exist_ok=True)
-    speeds = pd.read_csv(options.log or drive(options.out, 10 if options.quick else 50))
-    for side in ("left", "right"):
-        speeds[side] = 1.0 - speeds[f"realised_{side}"] / speeds[f"commanded_{side}"]
-    train, test = rtd.Recorded(speeds, columns=["left", "right"], channel="slip").split(0.8)
+    log = options.log or drive(options.out, 10 if options.quick else 50)
+    train, test = slip_of(log).split(0.8)
     fit = rtd.fit_process(train, "ar1")
     print(fit.summary(), rtd.fit_process(train, "sine").summary(), sep="\n")
     fit.plot(options.out / "fit.png", overwrite=True)

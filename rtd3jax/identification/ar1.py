@@ -13,12 +13,15 @@ from rtd3jax.identification.result import Estimate, Fit
 from rtd3jax.identification.slip import TOLERANCE, bounded_slip
 
 
-def fit_ar1(parts: Sequence[np.ndarray], max_slip: float | None = None) -> Fit:
+def fit_ar1(
+    parts: Sequence[np.ndarray], max_slip: float | None = None, rows_per_step: float = 1.0
+) -> Fit:
     """Fit `Ar1Slip` by the likelihood of a censored regression (Tobin, Econometrica 26, 1958).
 
     A slip within the bounds contributes its density; a slip at a bound contributes the probability
     of all values beyond the bound. The standard errors follow from the observed information at the
-    maximum.
+    maximum. If a step of the environment has another number of rows of the log than one, then rho
+    and sigma are converted: exactly, unless slip is clipped.
     """
 
     from scipy.optimize import minimize  # here, because its import takes a tenth of a second
@@ -55,25 +58,29 @@ def fit_ar1(parts: Sequence[np.ndarray], max_slip: float | None = None) -> Fit:
     steps = np.array([0.1 * sigma / math.sqrt(products[0]), 0.1 / math.sqrt(2.0 * x.size)])
     curvature = _curvature(loss, found.x, steps)
     notes = []
+    converted, slopes = _at_step(rho, sigma, rows_per_step)
     if rho in (0.0, 1.0):
         # The likelihood still rises beyond the bound: only sigma is at a maximum.
-        errors = np.array([math.nan, 1.0 / math.sqrt(curvature[1, 1])])
+        errors = np.array([math.nan, converted[1] / math.sqrt(curvature[1, 1])])
         notes.append(f"rho is at its bound {rho:g}, so it has no standard error.")
     else:
-        errors = np.sqrt(np.maximum(np.diag(np.linalg.inv(curvature)), 0.0))
+        covariance = slopes @ np.linalg.inv(curvature) @ slopes.T
+        errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     share = float(np.mean(~inside))
     if share > 0.0:
         notes.append(
             f"{100 * share:.1f}% of the slip was clipped and contributes a probability: compare "
             "AIC only among fits of ar1, and compare kinds by their error."
         )
+    if share > 0.0 and rows_per_step != 1.0:
+        notes.append("The conversion to another step is approximate where slip is clipped.")
     expected = _clipped_mean(rho * before, sigma, bound)
     return Fit(
         kind="ar1",
-        process=Ar1Slip(rho=rho, sigma=sigma, max_slip=bound),
+        process=Ar1Slip(rho=converted[0], sigma=converted[1], max_slip=bound),
         estimates={
-            "rho": Estimate(rho, float(errors[0])),
-            "sigma": Estimate(sigma, float(sigma * errors[1])),
+            "rho": Estimate(converted[0], float(errors[0])),
+            "sigma": Estimate(converted[1], float(errors[1])),
             "max_slip": Estimate(bound, math.nan),
         },
         log_likelihood=-float(found.fun),
@@ -82,7 +89,26 @@ def fit_ar1(parts: Sequence[np.ndarray], max_slip: float | None = None) -> Fit:
         method="maximum likelihood given each first value",
         notes=tuple(notes),
         sequences=tuple(parts),
+        process_of_rows=Ar1Slip(rho=rho, sigma=sigma, max_slip=bound),
     )
+
+
+def _at_step(rho: float, sigma: float, rows: float) -> tuple[tuple[float, float], np.ndarray]:
+    """rho and sigma of the process of every ``rows``-th value, if no value is clipped.
+
+    Returns:
+        Both, and their derivatives [2, 2] by (rho, log sigma). Those by rho have no meaning if rho
+        is 0 or 1.
+    """
+    if rho in (0.0, 1.0):
+        growth = math.sqrt(rows) if rho == 1.0 else 1.0
+        return (rho, growth * sigma), np.diag([0.0, growth * sigma])
+    decay = rho**rows
+    growth = math.sqrt((1.0 - decay**2) / (1.0 - rho**2))
+    by_rho = rows * decay / rho
+    log_growth = rho / (1.0 - rho**2) - decay * by_rho / (1.0 - decay**2)
+    slopes = [[by_rho, 0.0], [growth * sigma * log_growth, growth * sigma]]
+    return (decay, growth * sigma), np.array(slopes)
 
 
 def _curvature(

@@ -53,8 +53,12 @@ def draw_fit(
     path: str | os.PathLike,
     overwrite: bool,
     seed: int,
+    unit: str = "step",
 ) -> None:
-    """Write the plot of a process and the sequences [T, N]; see `Fit.plot`."""
+    """Write the plot of a process and the sequences [T, N]; see `Fit.plot`.
+
+    ``unit`` is the name of the time between two rows.
+    """
     target = check_target(path, overwrite)
     from matplotlib import rc_context
     from matplotlib.figure import Figure
@@ -70,7 +74,9 @@ def draw_fit(
         axes = figure.subplots(1, 3)
         _draw_distribution(axes[0], recorded, fitted)
         _draw_autocorrelation(axes[1], recorded, fitted)
+        axes[1].set_xlabel(f"lag in {unit}s")
         _draw_spectrum(axes[2], recorded, fitted)
+        axes[2].set_xlabel(f"cycles per {unit}")
         axes[0].legend()
         figure.suptitle(
             f"{kind}: {len(sequences)} recordings of {size} elements, and "
@@ -100,7 +106,7 @@ def _draw_autocorrelation(axis: Any, recorded: Sequence[np.ndarray], fitted: Seq
     for waves, colour, width in ((recorded, RECORDED, 2.2), (fitted, FITTED, 1.4)):
         axis.plot(autocorrelation(waves, lags), color=colour, lw=width)
     axis.axhline(0.0, color="#999999", linewidth=0.8)
-    axis.set(xlabel="lag in steps", ylabel="correlation", title="autocorrelation")
+    axis.set(ylabel="correlation", title="autocorrelation")
 
 
 def autocorrelation(waves: Sequence[np.ndarray], lags: int) -> np.ndarray:
@@ -124,7 +130,7 @@ def _draw_spectrum(axis: Any, recorded: Sequence[np.ndarray], fitted: Sequence[n
         power = spectrum(waves, rows)
         if power is not None:
             axis.loglog(np.fft.rfftfreq(rows)[1:], power[1:], color=colour, lw=width)
-    axis.set(xlabel="cycles per step", ylabel="power per frequency", title="spectrum")
+    axis.set(ylabel="power per frequency", title="spectrum")
 
 
 def spectrum(waves: Sequence[np.ndarray], rows: int) -> np.ndarray | None:

@@ -32,10 +32,11 @@ class Fit:
             and "ornstein-uhlenbeck", given the previous values.
         parameters: number of estimated parameters.
         error: root mean square residual, in the log's unit: the error of predicting a value from
-            the previous value; for "sine", the error of the fitted waves.
+            the previous value of the log; for "sine", the error of the fitted waves.
         method: the method of estimation, in a few words.
         notes: remarks on this fit, in sentences.
         sequences: the log, float64 [T, N] for each sequence.
+        process_of_rows: the process whose steps are the rows of the log; None means ``process``.
     """
 
     kind: str
@@ -47,6 +48,7 @@ class Fit:
     method: str
     notes: tuple[str, ...]
     sequences: tuple[np.ndarray, ...] = dataclasses.field(repr=False)
+    process_of_rows: Process | None = dataclasses.field(repr=False, default=None)
 
     @property
     def aic(self) -> float:
@@ -73,6 +75,8 @@ class Fit:
     def plot(self, path: str | os.PathLike, overwrite: bool = False, seed: int = 0) -> None:
         """Plot distribution, autocorrelation and spectrum of recorded and simulated sequences.
 
+        All are at the rate of the log, also if the fit is converted to that of the environment.
+
         Args:
             path: path of the picture; the suffix chooses the format (.png, .svg, .pdf).
             overwrite: whether to replace an existing file.
@@ -83,4 +87,6 @@ class Fit:
         """
         from rtd3jax.identification.picture import draw_fit
 
-        draw_fit(self.kind, self.process, self.sequences, path, overwrite, seed)
+        process = self.process if self.process_of_rows is None else self.process_of_rows
+        unit = "step" if process == self.process else "row"
+        draw_fit(self.kind, process, self.sequences, path, overwrite, seed, unit)

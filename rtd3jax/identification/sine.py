@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,11 +19,15 @@ SHORTEST = 8
 """Fewest rows of a wave that is fitted: a wave has three parameters and an offset."""
 TRIED = 3
 """Number of initial periods for the least squares: the best ones of the profile."""
+WIDEST = 4.0
+"""Largest factors of sine and cosine, and offset, that are tried, in units of ``max_slip``."""
 _FINENESS = 8
 """Number of periods in the profile from k to k + 1 cycles in a recording."""
 
 
-def fit_sine(parts: Sequence[np.ndarray], max_slip: float | None = None) -> Fit:
+def fit_sine(
+    parts: Sequence[np.ndarray], max_slip: float | None = None, rows_per_step: float = 1.0
+) -> Fit:
     """Fit `SineSlip`: a separate wave for each element of each recording, and one offset for all.
 
     A linear regression on sine and cosine, for each period of a grid, gives the initial period of a
@@ -31,7 +35,8 @@ def fit_sine(parts: Sequence[np.ndarray], max_slip: float | None = None) -> Fit:
     of all waves' offsets, weighted by their inverse variances, and the waves are fitted again with
     this offset. The process draws amplitudes and periods between the smallest and the largest of
     the log. Its waves have no noise; the estimate ``deviation`` is the standard deviation of the
-    residuals.
+    residuals. Periods are in steps of the environment, of which each has ``rows_per_step`` rows of
+    the log.
 
     Raises:
         UserError: when the log is not slip, or no recording is long enough.
@@ -66,20 +71,23 @@ def fit_sine(parts: Sequence[np.ndarray], max_slip: float | None = None) -> Fit:
         error = alone if count == 1 else float(values.std(ddof=1)) / math.sqrt(count)
         return Estimate(float(values.mean()), error)
 
-    shortest, longest = max(1, round(periods.min())), max(1, round(periods.max()))
+    def ends_of_period(rows: float) -> dict[str, int]:
+        """The ends of the range of periods in steps of so many rows, as whole numbers."""
+        shortest, longest = (max(1, round(end / rows)) for end in (periods.min(), periods.max()))
+        return {"period_min": shortest, "period_max": longest}
+
     estimates = {
         "amplitude": average(amplitudes, own[0]),
-        "period": average(periods, own[1]),
+        "period": average(periods / rows_per_step, own[1] / rows_per_step),
         "offset": Estimate(offset, 1.0 / math.sqrt(sum(weights))),
         "deviation": Estimate(
             math.sqrt(variance), math.sqrt(variance / (2.0 * max(residual.size - 3 * count, 1)))
         ),
     }
-    ends = {
+    ends: dict[str, Any] = {
         "amplitude_min": float(amplitudes.min()),
         "amplitude_max": float(amplitudes.max()),
-        "period_min": shortest,
-        "period_max": longest,
+        **ends_of_period(rows_per_step),
         "max_slip": bound,
     }
     estimates |= {name: Estimate(float(value), math.nan) for name, value in ends.items()}
@@ -91,17 +99,21 @@ def fit_sine(parts: Sequence[np.ndarray], max_slip: float | None = None) -> Fit:
             f"{SHORTEST} rows or do not change, {100 * left:.0f}% of the values: they were left "
             "out, so neither AIC nor the error can be compared with other kinds."
         )
+    limited = sum(
+        bool(np.any(np.abs([*one.x[[0, 1, 3]], *other.x[:2]]) > 0.99 * WIDEST * bound))
+        for one, other in zip(free, fits, strict=True)
+    )
+    if limited:
+        notes.append(
+            f"{limited} of {len(fits)} waves have the largest amplitude or offset that is tried, "
+            f"{WIDEST:g} times max_slip: they are clipped too much to tell their amplitude."
+        )
     cycles = max(len(wave) / period for wave, period in zip(waves, periods, strict=True))
     if cycles < 1.0:
         notes.append(f"No recording holds a whole period ({cycles:.2f} at most): record longer.")
-    process = SineSlip(
-        amplitude_min=ends["amplitude_min"],
-        amplitude_max=ends["amplitude_max"],
-        period_min=shortest,
-        period_max=longest,
-        offset=offset,
-        max_slip=bound,
-    )
+    if periods.min() < 2.0 * rows_per_step:
+        notes.append("The shortest waves have less than two steps in a period: they are aliased.")
+    process = SineSlip(**ends, offset=offset)
     # As in the other fits, only values with a previous value count, so that AIC is comparable.
     later = np.concatenate([fit.fun[1:] for fit in fits])
     mean_square = max(float(np.mean(later**2)), 1e-16)
@@ -115,6 +127,7 @@ def fit_sine(parts: Sequence[np.ndarray], max_slip: float | None = None) -> Fit:
         method="least squares of each wave, the period by its profile",
         notes=tuple(notes),
         sequences=tuple(parts),
+        process_of_rows=process.replace(**ends_of_period(1.0)),
     )
 
 
@@ -171,9 +184,8 @@ def _refit(wave: np.ndarray, bound: float, start: np.ndarray, offset: float) -> 
 
 def _limits(time: np.ndarray, bound: float) -> tuple[np.ndarray, np.ndarray]:
     """Limits of a wave's parameters. Without them, half a wave of any amplitude fits a line."""
-    slowest = np.pi / len(time)
-    low, high = [-bound, -bound, slowest, -bound], [bound, bound, np.pi, 2.0 * bound]
-    return np.array(low), np.array(high)
+    slowest, most = np.pi / len(time), WIDEST * bound
+    return np.array([-most, -most, slowest, -most]), np.array([most, most, np.pi, most])
 
 
 def _starts(wave: np.ndarray) -> list[np.ndarray]:

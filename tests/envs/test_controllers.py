@@ -47,8 +47,9 @@ def test_a_function_plays_like_any_policy():
 
 def test_a_function_keeps_the_types_of_its_state():
     env = rtd.make("pendulum", max_steps_in_episode=3)
-    count = rtd.function_policy(lambda n, _: (n * 1.0, n + 1.0), 0)
-    np.testing.assert_array_equal(rtd.rollout(count, env).actions[0, :, 0], [0, 1, 2])
+    for start, one in ((0, 1), (0.0, 1), (np.float32(0.0), 1.0)):
+        count = rtd.function_policy(lambda n, _, one=one: (n * 1.0, n + one), start)
+        np.testing.assert_array_equal(rtd.rollout(count, env).actions[0, :, 0], [0, 1, 2])
 
 
 def branching(state, observation):
@@ -69,6 +70,16 @@ def branching(state, observation):
 def test_what_a_function_does_wrong_is_one_line(function, match):
     with pytest.raises(rtd.UserError, match=match) as caught:
         rtd.evaluate(rtd.function_policy(function, 0.0), rtd.make("pendulum"), episodes=1)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("start", [0, False, {"sum": np.int32(0)}])
+def test_an_integer_state_that_would_lose_fractions_is_refused(start):
+    def integrate(state, observation):
+        return observation[:1], jax.tree.map(lambda part: part + 0.1 * observation[0], state)
+
+    with pytest.raises(rtd.UserError, match="lose its fractions: begin with a float") as caught:
+        rtd.evaluate(rtd.function_policy(integrate, start), rtd.make("pendulum"), episodes=1)
     assert "\n" not in str(caught.value)
 
 
@@ -119,6 +130,10 @@ def test_the_integral_does_not_wind_up(sign):
         ({"kd": "much"}, "kd must be numbers, not 'much'"),
         ({"elements": (0, 2)}, "elements must be 2 integers from 0 to 1"),
         ({"elements": (0,)}, "elements must be 2 integers from 0 to 1"),
+        ({"elements": 1}, "elements must be 2 integers from 0 to 1, not 1"),
+        ({"elements": (0.0, 1.0)}, "elements must be 2 integers from 0 to 1"),
+        ({"elements": (False, True)}, "elements must be 2 integers from 0 to 1"),
+        ({"elements": ((0,), 1)}, "elements must be 2 integers from 0 to 1"),
         ({"seconds": 0}, "seconds must be greater than 0, not 0"),
         ({"ignored": -1}, "ignored must be an integer of at least 0, not -1"),
     ],

@@ -48,6 +48,13 @@ def test_another_rate_is_interpolated_within_each_stretch():
     assert read_log(log, period=0.1, step=0.1)[0].shape == (4, 1)
 
 
+def test_a_multiple_of_the_period_takes_rows_as_they_are():
+    log = np.random.default_rng(0).normal(size=(10, 2))
+    for step in (0.3, 0.1 + 0.2):  # neither is a multiple of 0.1 in floating point
+        (rows,) = read_log(log, period=0.1, step=step)
+        np.testing.assert_array_equal(rows, log[::3])
+
+
 @pytest.mark.parametrize(
     ("content", "arguments", "match"),
     [
@@ -143,3 +150,56 @@ def test_a_column_without_a_name_is_not_taken_for_an_element(tmp_path):
         read_log(tmp_path / "log.csv")
     (episode,) = read_log(tmp_path / "log.csv", columns=["left", "right"])
     np.testing.assert_array_equal(episode, [[0.1, 0.3], [0.2, 0.1]])
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("time_s", np.arange(6) * 0.02 + np.tile([0.0, 0.001], 3)),
+        ("t", np.arange(6) * 0.02),
+        ("header.stamp", np.arange(6) + 1.7e9),
+        ("Time [ms]", [0, 20, 40, 60, NAN, 100]),
+        ("row", np.arange(12)),
+        ("count", np.arange(20) % 10),  # from zero in each of the two episodes
+    ],
+)
+def test_a_column_of_times_is_no_sensor(name, values):
+    noise = np.random.default_rng(0).normal(size=len(values))
+    table = pd.DataFrame({name: values, "left": noise, "right": 0.1})
+    if name == "count":
+        table["episode"] = np.repeat([0, 1], 10)
+    with pytest.raises(UserError, match=r"choose the elements with columns=\['left', 'right'\]"):
+        read_log(table)
+    assert read_log(table, columns=["left", "right"])[0].shape[1] == 2
+    assert read_log(table, columns=[name, "left"])[0].shape[1] == 2  # named, so it is meant
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("left", np.arange(6)),  # a ramp of few rows
+        ("left", np.cumsum(np.random.default_rng(0).uniform(0.5, 1.5, 50))),  # with noise
+        ("t", np.random.default_rng(0).normal(size=50)),  # a temperature
+        ("time", np.ones(50)),
+    ],
+)
+def test_other_columns_are_sensors(name, values):
+    assert read_log(pd.DataFrame({name: values}))[0].shape == (len(values), 1)
+
+
+def test_rows_in_a_list_are_not_taken_for_episodes():
+    rows = [np.array([0.1 * k, 0.2]) for k in range(20)]
+    for log in (rows, [row[:1] for row in rows]):
+        with pytest.raises(UserError, match=r"np.stack\(log\) .* each episode as an array") as one:
+            read_log(log)
+        assert "\n" not in str(one.value)
+    assert read_log(np.stack(rows))[0].shape == (20, 2)
+    assert len(read_log([np.arange(9.0)] * 20)) == 20
+    assert len(read_log([np.arange(8.0)] * 8)) == 8
+    assert [part.shape for part in read_log(list(np.arange(5.0)))] == [(5, 1)]
+
+
+def test_masked_values_are_gaps():
+    values = np.ma.masked_greater(np.array([[0, 1], [2, 3], [9, 4], [5, 6]]), 8)
+    for log in (values, [values], values.astype(np.float32)):
+        assert [part.tolist() for part in read_log(log)] == [[[0, 1], [2, 3]], [[5, 6]]]

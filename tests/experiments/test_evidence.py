@@ -340,7 +340,31 @@ def test_a_log_becomes_an_exported_policy(tmp_path, capsys):
     player = load(tmp_path / "policy.py").Player()
     player.reset()
     assert np.all(np.abs(player.step([-0.5, 0.0])) <= 1.0)
-    assert len((EXPERIMENTS / "from_a_log.py").read_text().splitlines()) <= 60
+    assert len((EXPERIMENTS / "from_a_log.py").read_text().splitlines()) <= 90
+
+
+@pytest.mark.slow
+def test_a_log_with_noise_and_a_halt_becomes_an_exported_policy(tmp_path, capsys):
+    script = load(EXPERIMENTS / "from_a_log.py")
+    log = pd.read_csv(script.drive(tmp_path, 10))
+    noise = np.random.default_rng(0).normal(0.0, 0.02, (len(log), 2))
+    log[["realised_left", "realised_right"]] += noise
+    log.loc[500:520, ["commanded_left", "realised_left"]] = 0.0
+    log.to_csv(tmp_path / "noisy.csv", index=False)
+    slip = script.slip_of(tmp_path / "noisy.csv")
+    assert len(slip.lengths) == 12 and np.isfinite(slip.values).all() and slip.values.min() < 0.0
+    assert [side.lengths.sum() for side in slip.split(0.8)] == [8 * 200 - 10 - 21, 2 * 200]
+    script.main([str(tmp_path / "noisy.csv"), "--quick", "--out", str(tmp_path)])
+    assert "trained on the recording: -" in capsys.readouterr().out
+    assert (tmp_path / "policy.py").exists()
+
+
+def test_a_log_that_the_script_cannot_read_is_one_line(tmp_path):
+    script = load(EXPERIMENTS / "from_a_log.py")
+    pd.DataFrame({"commanded_left": [0.5]}).to_csv(tmp_path / "log.csv", index=False)
+    with pytest.raises(SystemExit, match="error: .*has no column 'commanded_right'") as caught:
+        script.main([str(tmp_path / "log.csv"), "--quick", "--out", str(tmp_path)])
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.slow

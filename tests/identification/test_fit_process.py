@@ -242,7 +242,26 @@ def test_what_the_picture_shows():
         (np.arange(50.0), "ornstein-uhlenbeck", {}, "is not stationary"),
         (np.tile([0.0, 1.0], 30), "ornstein-uhlenbeck", {}, "has no memory, or alternates"),
         (np.repeat([0.0, 0.5], 30), "ar1", {}, "nearly all slip in the log is at a bound"),
-        (rtd.Recorded(np.arange(50.0)), "noise", {"step": 1}, "is for a log, not for a Recorded"),
+        (rtd.Recorded(np.arange(50.0)), "noise", {"columns": 1}, "for a log, not for a Recorded"),
+        (rtd.Recorded(np.arange(50.0)), "noise", {"step": 1}, "pass both period= .*, or neither"),
+        (
+            rtd.Recorded(np.arange(50.0), period=0.1, step=0.05),
+            "noise",
+            {},
+            "was interpolated when it was read, which biases a fit: read it without",
+        ),
+        (
+            rtd.Recorded(np.arange(50.0), period=0.1, step=0.05).split(0.5)[0].replace(mirror=True),
+            "noise",
+            {},
+            "was interpolated when it was read",
+        ),
+        (
+            rtd.Recorded(np.arange(50.0), period=0.1, step=0.2),
+            "noise",
+            {"period": 0.1, "step": 0.2},
+            "is for a log, not for a Recorded",
+        ),
         ([np.arange(6.0) / 10] * 5, "sine", {}, "no recording has 8 rows"),
         (np.full(50, np.nan), "noise", {}, "has no row with a number in every column"),
     ],
@@ -290,3 +309,120 @@ def test_noise_of_a_log_that_is_zero_after_its_first_value_is_refused():
 def test_slip_without_a_random_part_is_refused():
     with pytest.raises(rtd.UserError, match="ar1: the log has no random part"):
         rtd.fit_process([np.full((50, 1), 0.2), np.full((50, 1), 0.3)], "ar1")
+
+
+RATES = {"period": 0.1, "step": 0.05}
+"""Two steps of the environment for each row of the log."""
+
+
+@pytest.mark.parametrize("rows", [0.5, 1.5, 3.0])
+@pytest.mark.parametrize("kind", KNOWN)
+def test_a_log_of_another_rate_gives_the_process_of_the_environment(kind, rows):
+    """Interpolated rows would be smoother: twice the time constant, and less noise."""
+    process, episodes, truth = KNOWN[kind]
+    if kind == "ar1":  # never clipped, so that the conversion is exact
+        process = Ar1Slip(rho=0.99, sigma=0.003, max_slip=1.0)
+    log = logs_of(process, 1, 4 * episodes)[0]
+    if kind == "ar1":
+        log = log[(log.min(axis=(1, 2)) > 0.0)]
+    fit = rtd.fit_process(log, kind, period=0.1, step=0.1 * rows)
+    own = fit.process_of_rows or fit.process
+    if kind == "ar1":
+        decay = 0.99**rows
+        sigma = 0.003 * math.sqrt((1.0 - decay**2) / (1.0 - 0.99**2))
+        truth = {"rho": decay, "sigma": sigma}
+        assert own.rho == pytest.approx(0.99, abs=0.003)
+    if kind == "ornstein-uhlenbeck":
+        truth = {**truth, "time_constant": 5.0 / rows, "coefficient": math.exp(-0.2 * rows)}
+        assert own.time_constant == pytest.approx(5.0, rel=0.15)
+    for name, true in truth.items():
+        value, error = fit.estimates[name]
+        assert abs(value - true) < 3.0 * error < 0.5 * abs(true)
+        if name != "coefficient":
+            assert getattr(fit.process, name) == value
+    assert f"steps of {0.1 * rows:g} s" in fit.summary()
+    recorded = rtd.Recorded(log, channel="slip" if kind == "ar1" else "observation")
+    other = rtd.fit_process(recorded, kind, period=0.1, step=0.1 * rows)
+    for name in truth:
+        assert other.estimates[name].value == pytest.approx(fit.estimates[name].value, rel=1e-3)
+
+
+def test_errors_of_converted_slip_are_those_of_many_logs():
+    """The deviation of the estimates over the logs, with slip that is often clipped."""
+    logs = logs_of(Ar1Slip(rho=0.9, sigma=0.08), 200, 3)
+    fits = [rtd.fit_process(log, "ar1", **RATES) for log in logs]
+    for name in ("rho", "sigma"):
+        values, errors = np.array([fit.estimates[name] for fit in fits]).T
+        assert np.mean(errors) == pytest.approx(values.std(), rel=0.15)
+    assert np.mean([fit.process.rho for fit in fits]) == pytest.approx(0.9**0.5, abs=0.003)
+    assert "approximate where slip is clipped" in fits[0].summary()
+
+
+def test_waves_of_another_rate_have_the_periods_of_the_environment(tmp_path):
+    time = np.arange(300)
+    wave = (
+        0.3
+        + 0.1 * np.sin(2.0 * np.pi * time / 20)
+        + 0.01 * np.random.default_rng(0).normal(size=300)
+    )
+    fit = rtd.fit_process(wave, "sine", max_slip=1.0, **RATES)
+    assert fit.process.period_min == fit.process.period_max == 40
+    assert fit.estimates["period"].value == pytest.approx(40.0, abs=0.2)
+    assert fit.process_of_rows.period_min == 20
+    fit.plot(tmp_path / "fit.png")
+    slow = rtd.fit_process(wave, "sine", max_slip=1.0, period=0.1, step=1.5)
+    assert slow.process.period_min == 1 and "they are aliased" in slow.summary()
+
+
+def test_drifting_slip_is_converted_at_the_bound_of_rho():
+    steps = np.random.default_rng(0).normal(0.003, 0.003, (10, 150, 1))
+    log = list(np.clip(0.1 + np.cumsum(steps, axis=1), 0, 1))
+    fit, fine = (rtd.fit_process(log, "ar1", **rates) for rates in ({}, RATES))
+    assert fine.process.rho == 1.0
+    assert fine.process.sigma == pytest.approx(fit.process.sigma * math.sqrt(0.5))
+
+
+@pytest.mark.parametrize(("rows", "least"), [(30, 0.6), (200, 0.8), (400, 0.86)])
+def test_short_logs_of_a_slow_bias(rows, least):
+    """Without the correction, 28%, 70% and 80% of the intervals contain the time constant."""
+    rng = np.random.default_rng(0)
+    decay, logs = math.exp(-1.0 / 20.0), np.empty((300, rows))
+    logs[:, 0] = rng.normal(size=300)
+    for row in range(1, rows):
+        logs[:, row] = decay * logs[:, row - 1] + math.sqrt(1 - decay**2) * rng.normal(size=300)
+    fits = []
+    for log in logs:
+        try:
+            fits.append(rtd.fit_process(log, "ornstein-uhlenbeck"))
+        except UserError as error:
+            assert "not stationary" in str(error)
+    assert len(fits) > 280
+    for name, share in shares(fits, {"time_constant": 20.0, "sigma": 1.0}).items():
+        assert share > least, (name, share)
+    narrow = np.mean(["intervals are too narrow" in fit.summary() for fit in fits])
+    assert narrow > 0.9 if rows < 400 else narrow < 0.7
+    limited = ["cannot tell its time constant" in fit.summary() for fit in fits]
+    assert np.any(limited) == (rows < 400)
+
+
+def test_the_amplitude_of_a_clipped_wave_does_not_depend_on_its_phase():
+    time = np.arange(300)
+    for phase in (0.0, 0.7, 1.5, 3.0):
+        wave = np.clip(0.1 + 0.4 * np.sin(2.0 * np.pi * time / 50 + phase), 0.0, 0.2)
+        fit = rtd.fit_process(wave, "sine", max_slip=0.2)
+        assert fit.process.amplitude_max == pytest.approx(0.4, rel=1e-3)
+        assert "that is tried" not in fit.summary()
+    steep = np.clip(0.1 + 9.0 * np.sin(2.0 * np.pi * time / 50), 0.0, 0.2)
+    assert (
+        "1 of 1 waves have the largest amplitude or offset that is tried"
+        in rtd.fit_process(steep, "sine").summary()
+    )
+
+
+@pytest.mark.parametrize(
+    ("mean", "deviation", "differ"), [(0.0, 1.0, False), (3.0, 1.0, True), (0.0, 0.2, True)]
+)
+def test_elements_that_differ_too_much_are_said(mean, deviation, differ):
+    log = np.random.default_rng(0).normal(size=(300, 2)) * [1.0, deviation] + [0.0, mean]
+    notes = rtd.fit_process(log, "noise").notes
+    assert any("The elements differ: means from" in note for note in notes) == differ

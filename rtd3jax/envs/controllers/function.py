@@ -53,12 +53,23 @@ class FunctionPolicy:
                 f"{name} must return a state of the same shapes as its argument: {shapes[0]}, "
                 f"not {shapes[1]}"
             )
+        for old, new in zip(jax.tree.leaves(state), jax.tree.leaves(after), strict=True):
+            if _loses(old.dtype, jnp.result_type(new)):
+                raise UserError(
+                    f"{name} returns a state of {jnp.result_type(new)} for one of {old.dtype}, "
+                    "which would lose its fractions: begin with a float, such as state=0.0"
+                )
         # A loop needs a state of fixed types, but Python numbers in the function may change them.
         after = jax.tree.map(lambda new, old: jnp.asarray(new).astype(old.dtype), after, state)
         array = jnp.asarray(action, jnp.float32)
         if self.shape is None or array.size != math.prod(self.shape):
             return jnp.atleast_1d(array), after
         return array.reshape(self.shape), after
+
+
+def _loses(old: jnp.dtype, new: jnp.dtype) -> bool:
+    """Whether numbers of type ``new`` lose their fractions in a state of type ``old``."""
+    return jnp.issubdtype(new, jnp.inexact) and not jnp.issubdtype(old, jnp.inexact)
 
 
 def function_policy(
@@ -71,10 +82,12 @@ def function_policy(
     Args:
         function: a pure function in ``jax.numpy``. It is part of the compiled program: define it
             once, because each new function is compiled again.
-        state: the state at the first step of an episode, a pytree of numbers and arrays.
+        state: the state at the first step of an episode, a pytree of numbers and arrays. Its types
+            stay the same: begin with 0.0, not with 0, if the function returns floats.
 
     Raises:
-        UserError: if ``function`` is not a function, or JAX does not accept ``state``.
+        UserError: if ``function`` is not a function, or JAX does not accept ``state``. Where it
+            plays, if the function returns another structure or floats for integers.
     """
     if not callable(function):
         raise UserError(f"function_policy needs a function, not {function!r}")

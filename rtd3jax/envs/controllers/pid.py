@@ -68,6 +68,10 @@ class PIDPolicy:
         return action.reshape(self.action_shape), after
 
 
+def _is_index(value: object) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
+
+
 def pid_policy(
     env: EnvironmentLike,
     kp: ArrayLike | Sequence[float] = 0.0,
@@ -114,8 +118,11 @@ def pid_policy(
             f"pid_policy: {own.observation_size} observation elements for {size} actions: "
             "pass elements=(...), the index of the element that each action controls"
         )
-    chosen = tuple(range(size)) if elements is None else tuple(elements)
-    inside = all(isinstance(k, int | np.integer) and 0 <= k < own.observation_size for k in chosen)
+    try:
+        chosen = tuple(range(size) if elements is None else elements)
+    except TypeError:  # one number
+        chosen = ()
+    inside = all(_is_index(k) and 0 <= k < own.observation_size for k in chosen)
     if len(chosen) != size or not inside:
         raise UserError(
             f"pid_policy: elements must be {size} integers from 0 to {own.observation_size - 1}, "

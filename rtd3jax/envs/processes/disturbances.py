@@ -12,7 +12,14 @@ import numpy as np
 from flax import struct
 from jax.typing import ArrayLike
 
-from rtd3jax.envs.processes.process import Process, float32, require, require_ordered
+from rtd3jax.envs.processes.process import (
+    Process,
+    float32,
+    require,
+    require_ordered,
+    require_size,
+    require_whole,
+)
 from rtd3jax.errors import UserError
 
 
@@ -26,6 +33,12 @@ def element_mask(elements: tuple[int, ...], size: int) -> np.ndarray:
 def check_elements(process: object, elements: tuple[int, ...], size: int | None = None) -> None:
     """Raise UserError unless the elements are distinct indices of an observation of ``size``."""
     name = type(process).__name__
+    whole = isinstance(elements, tuple) and all(
+        isinstance(element, int | np.integer) and not isinstance(element, bool)
+        for element in elements
+    )
+    if not whole:
+        raise UserError(f"{name}: elements={elements!r} must be a tuple of indices, such as (0, 1)")
     if not elements or len(set(elements)) != len(elements) or min(elements) < 0:
         raise UserError(f"{name}: elements {elements} must be distinct, not negative, at least one")
     if size is not None and max(elements) >= size:
@@ -112,8 +125,8 @@ class Pulses(Process):
         require(self, "amplitude_min")
         require(self, "amplitude_max")
         require_ordered(self, "amplitude_min", "amplitude_max")
-        require(self, "count", low=0)
-        require(self, "length", low=1)
+        require_whole(self, "count", low=0)
+        require_whole(self, "length", low=1)
         check_elements(self, self.elements)
 
 
@@ -180,7 +193,7 @@ class Sine(Process):
     def validate(self) -> None:
         """Check the ranges of amplitude and period."""
         _validate_wave(self)
-        require(self, "waves", low=1)
+        require_whole(self, "waves", low=1)
 
 
 class DampedSine(Process):
@@ -255,6 +268,11 @@ class GaussianNoise(Process):
         noise = jax.random.normal(key, signal.shape, jnp.float32)
         return signal + float32(self.sigma) * noise, state
 
+    def output_size(self, size: int) -> int:
+        """Unchanged; UserError unless sigma is one number or [size]."""
+        require_size(self, size, "sigma")
+        return size
+
     def validate(self) -> None:
         """Check sigma."""
         require(self, "sigma", low=0)
@@ -282,4 +300,5 @@ class Hidden(Process):
 
     def validate(self) -> None:
         """Check the element."""
+        require_whole(self, "element", low=0)
         check_elements(self, (self.element,))

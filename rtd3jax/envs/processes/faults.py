@@ -11,8 +11,14 @@ import jax.numpy as jnp
 from flax import struct
 
 from rtd3jax.envs.processes.disturbances import check_elements, element_mask
-from rtd3jax.envs.processes.process import Process, float32, require, require_ordered
-from rtd3jax.errors import UserError
+from rtd3jax.envs.processes.process import (
+    Process,
+    float32,
+    require,
+    require_ordered,
+    require_size,
+    require_whole,
+)
 
 
 class Dropout(Process):
@@ -64,9 +70,7 @@ class Delay(Process):
 
     def validate(self) -> None:
         """Check the number of steps."""
-        require(self, "steps", low=0)
-        if int(self.steps) != self.steps:
-            raise UserError(f"Delay: steps={self.steps} must be a whole number")
+        require_whole(self, "steps", low=0)
 
 
 class Quantisation(Process):
@@ -87,6 +91,11 @@ class Quantisation(Process):
         """Round the signal."""
         resolution = jnp.broadcast_to(float32(self.resolution), signal.shape)
         return resolution * jnp.round(signal / resolution), state
+
+    def output_size(self, size: int) -> int:
+        """Unchanged; UserError unless the resolution is one number or [size]."""
+        require_size(self, size, "resolution")
+        return size
 
     def validate(self) -> None:
         """Check the resolution."""
@@ -117,6 +126,11 @@ class GainDrift(Process):
         noise = float32(self.sigma) * jax.random.normal(key, state.shape, jnp.float32)
         evolved = jnp.clip(state + noise, float32(self.gain_min), float32(self.gain_max))
         return state * signal, evolved
+
+    def output_size(self, size: int) -> int:
+        """Unchanged; UserError unless the parameters are one number or [size] each."""
+        require_size(self, size, "sigma", "gain_min", "gain_max")
+        return size
 
     def validate(self) -> None:
         """Check the deviation and the limits of the gain."""
@@ -159,7 +173,8 @@ class OrnsteinUhlenbeck(Process):
         return signal + element_mask(self.elements or tuple(range(size)), size) * state, evolved
 
     def output_size(self, size: int) -> int:
-        """Unchanged."""
+        """Unchanged; UserError unless the parameters are one number or [size] each."""
+        require_size(self, size, "sigma", "time_constant", "mean")
         if self.elements:
             check_elements(self, self.elements, size)
         return size

@@ -1,7 +1,10 @@
 """A mixture of disturbances: each episode draws one of them."""
 
+import math
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from rtd3jax.envs.processes.process import Composition
@@ -63,8 +66,12 @@ class Mixture(Composition):
 
     def validate(self) -> None:
         """Check the weights and every member."""
-        if not self.processes:
-            raise UserError("Mixture has no members: pass processes=(process, process, ...)")
+        super().validate()
+        if not isinstance(self.weights, tuple) or not all(map(_is_weight, self.weights)):
+            raise UserError(
+                f"Mixture: weights={self.weights!r} must be a tuple of finite numbers, one for "
+                "each member"
+            )
         if self.weights and len(self.weights) != len(self.processes):
             raise UserError(
                 f"Mixture: {len(self.weights)} weights for {len(self.processes)} members; pass "
@@ -74,4 +81,9 @@ class Mixture(Composition):
             raise UserError(
                 f"Mixture: weights={self.weights} must not be negative, and one must be positive"
             )
-        super().validate()
+
+
+def _is_weight(weight: object) -> bool:
+    if isinstance(weight, bool) or not isinstance(weight, int | float | np.number):
+        return False
+    return math.isfinite(weight)

@@ -74,8 +74,23 @@ class Composition(Process):
         )
 
     def validate(self) -> None:
-        """Validate every member."""
-        for process in self.processes:
+        """Check that the members are processes, and validate each."""
+        name, members = type(self).__name__, self.processes
+        if not isinstance(members, tuple | list):
+            raise UserError(
+                f"{name}: the processes must be a tuple, {name}((process, process, ...)), not "
+                f"{members!r}"
+            )
+        if not members:
+            raise UserError(f"{name} has no members: pass processes=(process, process, ...)")
+        for process in members:
+            if isinstance(process, type):
+                raise UserError(
+                    f"{name}: {process.__name__} is a class; pass an instance, such as "
+                    f"{process.__name__}()"
+                )
+            if not isinstance(process, Process):
+                raise UserError(f"{name}: {process!r} is not a process, such as rtd.Dropout()")
             process.validate()
 
     def check_use(self, horizon: int, field: str) -> None:
@@ -178,6 +193,30 @@ def require(
         raise UserError(f"{where} must be greater than {above:g}")
     if np.any(numbers > high):
         raise UserError(f"{where} must be at most {high:g}")
+
+
+def require_whole(process: object, name: str, low: int) -> None:
+    """Raise UserError unless field ``name``, which is static, is an integer of at least ``low``."""
+    value = getattr(process, name)
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise UserError(
+            f"{type(process).__name__}: {name}={value!r} must be a whole number, written without "
+            "a decimal point"
+        )
+    require(process, name, low=low)
+
+
+def require_size(process: object, size: int, *names: str) -> None:
+    """Raise UserError unless each field is one number or an array [size]."""
+    for name in names:
+        value = getattr(process, name)
+        # A list may hold tracers, of which numpy cannot make an array.
+        shape = (len(value),) if isinstance(value, list | tuple) else np.shape(value)
+        if shape not in ((), (size,)):
+            raise UserError(
+                f"{type(process).__name__}: {name} of shape {shape} does not fit a signal of "
+                f"{size} element{'s' * (size != 1)}; pass one number, or one for each element"
+            )
 
 
 def require_ordered(process: object, low_name: str, high_name: str) -> None:

@@ -1,15 +1,16 @@
 """Disturbances that replay a recording."""
 
 import hashlib
+import warnings
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from rtd3jax.envs.log import read_log
+from rtd3jax.envs.log import read_episodes, rows_per_step
 from rtd3jax.envs.processes.disturbances import check_elements
 from rtd3jax.envs.processes.process import Process, float32, require, require_ordered
 from rtd3jax.errors import UserError, nearest
@@ -22,6 +23,8 @@ _LEAVES = {"values", "begins", "lengths", "low", "high"}
 PLAYED_ON = ("observation", "action", "reward", "slip")
 MOST_ROWS = 2**31 - 1
 """Rows of all recordings, at most: rows are counted with int32."""
+FAR = 0.1
+"""A split that misses the wanted fraction of the rows by more than this is reported."""
 
 
 class RecordedState(struct.PyTreeNode):
@@ -37,11 +40,15 @@ class RecordedState(struct.PyTreeNode):
     """int32 [N]: number of its rows"""
     start: jax.Array
     """int32 [N]: row of the recording at which the episode starts"""
+    elements: tuple[int, ...] = struct.field(pytree_node=False, default=())
+    """indices of the disturbed elements of the signal; () means all"""
+    size: int = struct.field(pytree_node=False, default=0)
+    """elements of the signal"""
 
     @property
     def slip(self) -> jax.Array:
-        """float32 [N], the current values, under the name that the rover's pictures read."""
-        return self.value
+        """float32 [size], the current values, under the name that the rover's pictures read."""
+        return _placed(self.value, self.elements, self.size)
 
 
 class Recorded(Process):
@@ -73,6 +80,13 @@ class Recorded(Process):
     independent: bool = struct.field(pytree_node=False)
     mirror: bool = struct.field(pytree_node=False)
 
+    # What only `split` and `rtd3jax.fit_process` need is no field, so it is no part of a program
+    # or of a plant's identity. Transformations of JAX lose it; `replace` keeps it.
+    episode_of: ClassVar[np.ndarray | None] = None
+    """int64 [E]: number of the episode that each recording is a part of; None if it is not known"""
+    log_rows_per_step: ClassVar[float] = 1.0
+    """Rows of the log in one step; unless it is whole, the rows are interpolated."""
+
     def __init__(
         self,
         log: object = None,
@@ -99,7 +113,8 @@ class Recorded(Process):
                 `rtd3jax.envs.log.read_log` for this and the next three arguments.
             episode: the column that numbers the episodes; "episode" by default, if there is one.
             period: time in s between two samples of the log.
-            step: time in s between two steps of the environment; the log is interpolated linearly.
+            step: time in s between two steps of the environment; the log is interpolated linearly,
+                unless ``step`` is a multiple of ``period``.
             bounds: (low, high), to which the values are clipped, numbers or arrays [N]; none by
                 default.
             elements: indices of the disturbed elements of the signal, one for each column; () means
@@ -126,9 +141,13 @@ class Recorded(Process):
         else:
             if log is None:
                 raise UserError("Recorded needs a log: a CSV or Parquet file, or an array [T, N]")
-            stretches = read_log(log, columns, episode, period, step)
+            episodes = read_episodes(log, columns, episode, period, step)
             low, high = _bounds(bounds)
+            stretches = [part for parts in episodes for part in parts]
             fields = {**_leaves(stretches), "low": low, "high": high}
+            numbers = np.repeat(np.arange(len(episodes)), [len(parts) for parts in episodes])
+            object.__setattr__(self, "episode_of", numbers)
+            object.__setattr__(self, "log_rows_per_step", rows_per_step(period, step))
         fields |= {
             "channel": channel,
             "elements": elements,
@@ -157,6 +176,8 @@ class Recorded(Process):
             begin=jnp.broadcast_to(jnp.asarray(self.begins, jnp.int32)[which], (count,)),
             length=jnp.broadcast_to(lengths[which], (count,)),
             start=jnp.broadcast_to(place - (ends[which] - starts[which]), (count,)),
+            elements=self.elements,
+            size=size,
         )
         return state.replace(value=self._value(state))
 
@@ -188,10 +209,7 @@ class Recorded(Process):
         self, key: jax.Array, state: RecordedState, signal: jax.Array
     ) -> tuple[jax.Array, RecordedState]:
         """Apply the values of a row, then go to the next row."""
-        value = state.value
-        if self.elements:
-            everything = jnp.zeros(signal.shape, jnp.float32)
-            value = everything.at[jnp.asarray(self.elements, jnp.int32)].set(value)
+        value = _placed(state.value, self.elements, signal.shape[-1])
         signal = (1.0 - value) * signal if self.channel == "slip" else signal + value
         state = state.replace(time=state.time + 1)
         return signal, state.replace(value=self._value(state))
@@ -270,8 +288,9 @@ class Recorded(Process):
     def split(self, fraction: float = 0.8) -> tuple["Recorded", "Recorded"]:
         """Split into the first ``fraction`` of the rows, for training, and the rest, for tests.
 
-        With several recordings, the split lies between two of them, as near to ``fraction`` as
-        possible, so no recording is on both sides. A single recording is split in time.
+        With several episodes, the split lies between two of them, as near to ``fraction`` as
+        possible, so no episode is on both sides, even if gaps divide it into several recordings.
+        It warns if a side then has far more rows than wanted. A single episode is split in time.
 
         Raises:
             UserError: if one of the sides would be empty.
@@ -280,18 +299,46 @@ class Recorded(Process):
         if not number or not 0.0 < fraction < 1.0:
             raise UserError(f"split: fraction={fraction!r} must lie between 0 and 1")
         parts = self.sequences()
-        rows = sum(map(len, parts))
-        if len(parts) > 1:
-            shares = np.cumsum([len(part) for part in parts])[:-1] / rows
-            cut = int(np.argmin(np.abs(shares - fraction))) + 1
-            sides = parts[:cut], parts[cut:]
+        own = np.arange(len(parts)) if self.episode_of is None else self.episode_of
+        ends = np.cumsum([len(part) for part in parts])
+        rows = int(ends[-1])
+        between = ends[:-1][own[1:] != own[:-1]]
+        if between.size:
+            cut = int(between[np.argmin(np.abs(between / rows - fraction))])
         else:
             cut = round(fraction * rows)
             if not 0 < cut < rows:
                 raise UserError(f"split: {rows} rows cannot be split at {fraction:g} of them")
-            sides = [parts[0][:cut]], [parts[0][cut:]]
-        first, second = (self.replace(**_leaves(side)) for side in sides)
-        return first, second
+        if abs(cut / rows - fraction) > FAR:
+            warnings.warn(
+                f"split: the first side has {100 * cut / rows:.0f}% of the rows, not "
+                f"{100 * fraction:.0f}%, because no episode is divided; record more episodes, or "
+                "number shorter ones",
+                stacklevel=2,
+            )
+        # Rows of each recording that lie before the cut: all, none, or a part of one.
+        before = [
+            min(max(cut - (end - len(part)), 0), len(part))
+            for part, end in zip(parts, ends, strict=True)
+        ]
+        first = [part[:count] for part, count in zip(parts, before, strict=True)]
+        second = [part[count:] for part, count in zip(parts, before, strict=True)]
+        return self._of(first, own), self._of(second, own)
+
+    def _of(self, stretches: Sequence[np.ndarray], episode_of: np.ndarray) -> "Recorded":
+        """The same options with these sequences, without the empty ones."""
+        some = np.array([len(part) > 0 for part in stretches])
+        recorded = self.replace(**_leaves([part for part in stretches if len(part)]))
+        object.__setattr__(recorded, "episode_of", episode_of[some])
+        return recorded
+
+    def replace(self, **changes: Any) -> Self:
+        """A copy with other values of these fields; it knows the episodes of the same rows."""
+        other = super().replace(**changes)
+        if not changes.keys() & {"values", "begins", "lengths"}:
+            object.__setattr__(other, "episode_of", self.episode_of)
+        object.__setattr__(other, "log_rows_per_step", self.log_rows_per_step)
+        return other
 
     def _digest(self) -> tuple:
         leaves = (self.values, self.begins, self.lengths, self.low, self.high)
@@ -324,6 +371,14 @@ class Recorded(Process):
             f"Recorded({self.lengths.shape[-1]} recordings, {self.values.shape[-2]:,} rows of "
             f"{self.values.shape[-1]}, channel={self.channel!r})"
         )
+
+
+def _placed(value: jax.Array, elements: tuple[int, ...], size: int) -> jax.Array:
+    """The values [..., N] at these elements of a signal [..., size], and zeros elsewhere."""
+    if not elements:
+        return value
+    everything = jnp.zeros((*value.shape[:-1], size), jnp.float32)
+    return everything.at[..., jnp.asarray(elements, jnp.int32)].set(value)
 
 
 def _refuse_reading(**arguments: object) -> None:

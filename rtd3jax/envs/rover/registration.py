@@ -30,8 +30,8 @@ def next_slip(state: RoverState) -> jax.Array | None:
     """The slip [..., 2] that acts in the next step; None if the state does not state it.
 
     Joined slips act in sequence, so their tractions, one minus the slip, are multiplied. The result
-    is None if one of them has no field ``slip``, or acts on one wheel, since it does not state on
-    which. The state of a `Sum`, which no name makes, looks like that of joined slips.
+    is None if one of them does not state the slip of both wheels. The state of a `Sum`, which no
+    name makes, looks like that of joined slips.
     """
     if type(state.slip) is not tuple:
         return getattr(state.slip, "slip", None)

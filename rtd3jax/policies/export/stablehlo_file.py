@@ -175,12 +175,16 @@ class StableHlo:
         }
 
     def step(self, state: State, observation: ArrayLike) -> tuple[jax.Array, State]:
-        """Actions [B, *action_shape] for float32 observations [B, O], and the state after them.
+        """Actions [B, *action_shape] for observations [B, O], and the state after them.
+
+        The program needs float32, so observations of another type are converted.
 
         Raises:
             UserError: when the observations have another size.
         """
-        if not isinstance(observation, jax.Array):
+        if isinstance(observation, jax.Array):
+            observation = observation.astype(jnp.float32)
+        else:
             observation = np.asarray(observation, np.float32)
         if observation.ndim != 2 or observation.shape[1] != self.observation_size:
             raise UserError(

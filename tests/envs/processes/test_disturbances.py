@@ -380,11 +380,19 @@ def test_parameters_can_be_mapped_over():
         (DampedSine(amplitude_max=float("inf")), "amplitude_max"),
         (Hidden(element=-1), "element"),
         (Chain(processes=(GaussianNoise(sigma=-1.0),)), "sigma"),
+        (Pulses(count=2.5), "count=2.5 must be a whole number, written without"),
+        (Pulses(count=True), "count"),
+        (Pulses(length=3.0), "length=3.0 must be a whole number, written without"),
+        (Sine(waves=2.0), "waves=2.0 must be a whole number, written without"),
+        (Sine(elements=(0.0, 1)), "elements=.* must be a tuple of indices"),
+        (Sine(elements=1), "elements=1 must be a tuple of indices"),
+        (Hidden(element=2.0), "element=2.0 must be a whole number, written without"),
     ],
 )
 def test_bad_parameters_are_named(process, name):
-    with pytest.raises(UserError, match=name):
+    with pytest.raises(UserError, match=name) as caught:
         process.validate()
+    assert "\n" not in str(caught.value)
 
 
 def test_an_element_outside_the_observation_is_refused():

@@ -116,6 +116,16 @@ def test_directories_tell_a_mixture_from_other_names():
         (lambda: rtd.make("pendulum", "noise/hidden+"), "unknown disturbance ''"),
         (lambda: rtd.make("pendulum", "noise/random-sine", weights=(1,)), "1 weights for 2"),
         (lambda: rtd.make("pendulum", "noise/random-sine", weights=(0, 0)), "must be positive"),
+        (
+            lambda: rtd.disturb(
+                rtd.make("rover"), rtd.Mixture((rtd.Dropout(),) * 2, (1, float("nan")))
+            ),
+            "weights=(1, nan) must be a tuple of finite numbers",
+        ),
+        (
+            lambda: rtd.disturb(rtd.make("rover"), rtd.Mixture((rtd.Dropout(),), "1")),
+            "must be a tuple of finite numbers",
+        ),
         (lambda: rtd.make("pendulum", "noise", weights=(1, 2)), "no parameter 'weights'"),
         (
             lambda: rtd.make("pendulum", "noise/noise", sigma=1.0),

@@ -1,6 +1,7 @@
 """Compares replayed disturbances with the recorded rows."""
 
 import json
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ import pytest
 import rtd3jax as rtd
 from rtd3jax.envs import registry
 from rtd3jax.envs.rover import Rover, RoverParams
+from rtd3jax.envs.rover.slip import ConstantSlip
 from rtd3jax.errors import UserError
 from rtd3jax.system.files import read_arrays
 
@@ -242,3 +244,51 @@ def test_a_registered_recording_is_made_by_name(monkeypatch):
         rtd.evaluate(COMMAND, rtd.make("our-rover", "yard"))
     mirrored = rtd.make("our-rover", "yard", mirror=True)
     assert rtd.evaluate(COMMAND, mirrored, 1).shape == (1,)
+
+
+def test_a_split_leaves_episodes_whole_in_spite_of_gaps():
+    log = np.stack(numbered(10, 10, 10, 10, 10))
+    log[3, 2] = log[4, 8] = np.nan
+    for recorded in (rtd.Recorded(log), rtd.Recorded(log).replace(mirror=True)):
+        train, test = recorded.split(0.65)  # nearest to the gap of the fourth episode
+        assert [part[0, 0] for part in train.sequences()] == [0, 100, 200]
+        assert [part[0, 0] for part in test.sequences()] == [300, 303, 400, 409]
+        train, test = test.split(0.5)
+        assert [part[0, 0] for part in train.sequences()] == [300, 303]
+
+
+def test_a_single_episode_with_a_gap_is_split_in_time():
+    log = np.arange(10_000.0)
+    log[50] = np.nan
+    train, test = rtd.Recorded(log).split(0.8)
+    assert [len(part) for part in train.sequences()] == [50, 7949]
+    assert [part[0, 0] for part in test.sequences()] == [8000.0] and len(test.values) == 2000
+    train, test = train.split(0.5)
+    assert [len(part) for part in train.sequences()] == [50, 3950]
+
+
+def test_a_split_far_from_the_wanted_one_warns():
+    with pytest.warns(UserWarning, match="first side has 50% of the rows, not 80%, because"):
+        rtd.Recorded(numbered(10, 10)).split(0.8)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rtd.Recorded(numbered(10, 10, 10, 10)).split(0.8)
+
+
+@pytest.mark.parametrize(
+    ("elements", "columns"), [((1, 0), [1, 0]), ((1,), [None, 0]), ((0,), [0, None])]
+)
+def test_slip_is_shown_at_the_wheel_that_it_acts_on(elements, columns):
+    log = np.random.default_rng(0).uniform(0.1, 0.5, (STEPS, len(elements)))
+    slip = rtd.Recorded(log, channel="slip", elements=elements)
+    expected = np.stack(
+        [np.zeros(STEPS) if column is None else log[:, column] for column in columns], axis=1
+    )
+    env = Rover(RoverParams(slip=slip, max_steps_in_episode=STEPS))
+    frame = rtd.rollout(COMMAND, env).to_frame()
+    np.testing.assert_allclose(frame[["slip left", "slip right"]][:-1], expected, rtol=1e-6)
+    joined = rtd.Chain((slip, ConstantSlip(0.5)))
+    env = Rover(RoverParams(slip=joined, max_steps_in_episode=STEPS))
+    frame = rtd.rollout(COMMAND, env).to_frame()
+    both = 1.0 - 0.5 * (1.0 - expected)
+    np.testing.assert_allclose(frame[["slip left", "slip right"]][:-1], both, rtol=1e-6)

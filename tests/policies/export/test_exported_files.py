@@ -141,6 +141,19 @@ def test_a_stablehlo_policy_refuses_other_observations(program):
     assert action.shape == (1, 2)
 
 
+@pytest.mark.parametrize("kind", [jnp.int32, jnp.float16, jnp.bfloat16])
+def test_a_stablehlo_policy_converts_observations_to_float32(program, kind):
+    policy = rtd.load_stablehlo(program)
+    seen = np.array([[1.0, -2.0]], np.float32)
+    expected, _ = policy.step(policy.init(), seen)
+    for step in (policy.step, jax.jit(policy.step)):
+        action, _ = step(policy.init(), jnp.asarray(seen, kind))
+        np.testing.assert_allclose(action, expected, rtol=1e-5)
+    with jax.enable_x64(True):
+        action, _ = policy.step(policy.init(), jnp.asarray(seen, jnp.float64))
+    np.testing.assert_allclose(action, expected, rtol=1e-5)
+
+
 def test_what_is_no_stablehlo_policy_is_refused(program, tmp_path, policy):
     arrays, about = read_arrays(program)
     path = tmp_path / "p"
