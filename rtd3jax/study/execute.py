@@ -116,8 +116,8 @@ def prepare_files(directory: RunDirectory, jobs: Sequence[Job], checkpoints: Che
     Raises:
         UserError: when one of them cannot be written.
     """
-    for job in jobs:
-        directory.lanes.prepare(*job.key)
+    for cell in dict.fromkeys(job.cell for job in jobs):
+        directory.lanes.prepare(cell)
     checkpoints.prepare(jobs)
 
 

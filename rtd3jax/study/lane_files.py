@@ -7,7 +7,6 @@ derived from these files.
 
 import hashlib
 import re
-import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,13 @@ from rtd3jax.errors import UserError
 from rtd3jax.policies.serialization import read_interface, restore_policy, under_prefix
 from rtd3jax.policies.trained import FORMAT, Policy
 from rtd3jax.study.cells import Cell
-from rtd3jax.system.files import read_arrays, read_metadata, write_arrays, write_text_atomically
+from rtd3jax.system.files import (
+    make_writable,
+    read_arrays,
+    read_metadata,
+    write_arrays,
+    write_text_atomically,
+)
 
 MOST_LETTERS = 220
 """Maximum length of a cell's name. File systems allow names of 255 bytes, and other files have
@@ -59,13 +64,11 @@ class LaneFiles:
             raise UserError(f"{path} leads outside {self.path}; remove the link")
         return path
 
-    def prepare(self, cell: Cell, seed: int) -> None:
-        """Make the directory of a lane's file, and raise UserError if it cannot be written."""
-        directory = self.lane_path(cell, seed).parent
+    def prepare(self, cell: Cell) -> None:
+        """Make the directory of a cell's lanes, and raise UserError if it cannot be written."""
+        directory = self._within("lanes", cell_name(cell))
         try:
-            directory.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=directory):
-                pass
+            make_writable(directory)
         except OSError as error:
             raise UserError(
                 f"{directory} cannot be written: {error.strerror}; lanes are trained only where "

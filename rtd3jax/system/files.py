@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 import secrets
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,13 @@ def write_text_atomically(path: str | os.PathLike, text: str) -> None:
     A "?" replaces each byte of a path in ``text`` that is not text.
     """
     write_bytes_atomically(path, text.encode("utf-8", "replace"))
+
+
+def make_writable(directory: Path) -> None:
+    """Make ``directory``, and raise OSError unless files can be written in it."""
+    directory.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=directory):
+        pass
 
 
 def check_target(path: str | os.PathLike, overwrite: bool = False) -> Path:

@@ -16,6 +16,11 @@ def is_whole(value: Any) -> bool:
         return False
 
 
+def is_integer(value: Any) -> bool:
+    """Whether ``value`` is an integer of Python or numpy: no bool, and no float such as 3.0."""
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
+
+
 def check_count(name: str, value: Any, low: int) -> None:
     """Raise UserError, which names the value, unless it is an integer from ``low`` to 2**32 - 1."""
     if not is_whole(value) or not low <= value < 2**32:

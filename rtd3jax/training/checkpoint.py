@@ -8,7 +8,6 @@ if the process may use the same number of cores on the same kind of processor: X
 by this number. Otherwise it differs by rounding.
 """
 
-import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterable
@@ -16,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from rtd3jax.errors import UserError
-from rtd3jax.system.files import read_arrays, write_arrays
+from rtd3jax.system.files import make_writable, read_arrays, write_arrays
 from rtd3jax.system.jax_settings import jax_settings
 from rtd3jax.system.versions import versions_of
 from rtd3jax.training.checkpoint_arrays import extended, from_arrays, to_arrays
@@ -134,9 +133,7 @@ class Checkpoints:
         for job in jobs:
             directory = self._directory_of(job)
             try:
-                directory.mkdir(parents=True, exist_ok=True)
-                with tempfile.TemporaryFile(dir=directory):
-                    pass
+                make_writable(directory)
             except OSError as error:
                 raise _unwritable(directory, error) from error
 

@@ -14,6 +14,7 @@ from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.interface import describe
 from rtd3jax.errors import UserError
 from rtd3jax.protocols import EnvironmentLike
+from rtd3jax.system.numbers import is_integer
 
 
 class PIDState(NamedTuple):
@@ -68,10 +69,6 @@ class PIDPolicy:
         return action.reshape(self.action_shape), after
 
 
-def _is_index(value: object) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool)
-
-
 def pid_policy(
     env: EnvironmentLike,
     kp: ArrayLike | Sequence[float] = 0.0,
@@ -122,7 +119,7 @@ def pid_policy(
         chosen = tuple(range(size) if elements is None else elements)
     except TypeError:  # one number
         chosen = ()
-    inside = all(_is_index(k) and 0 <= k < own.observation_size for k in chosen)
+    inside = all(is_integer(k) and 0 <= k < own.observation_size for k in chosen)
     if len(chosen) != size or not inside:
         raise UserError(
             f"pid_policy: elements must be {size} integers from 0 to {own.observation_size - 1}, "
@@ -130,7 +127,7 @@ def pid_policy(
         )
     if not (np.ndim(seconds) == 0 and np.isfinite(seconds) and seconds > 0):
         raise UserError(f"pid_policy: seconds must be greater than 0, not {seconds!r}")
-    if isinstance(ignored, bool) or not isinstance(ignored, int | np.integer) or ignored < 0:
+    if not is_integer(ignored) or ignored < 0:
         raise UserError(f"pid_policy: ignored must be an integer of at least 0, not {ignored!r}")
     values = {"kp": kp, "ki": ki, "kd": kd, "setpoint": setpoint, "feedforward": feedforward}
     arrays = {name: vector("pid_policy", name, value, size) for name, value in values.items()}

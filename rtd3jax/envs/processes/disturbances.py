@@ -21,6 +21,7 @@ from rtd3jax.envs.processes.process import (
     require_whole,
 )
 from rtd3jax.errors import UserError
+from rtd3jax.system.numbers import is_integer
 
 
 def element_mask(elements: tuple[int, ...], size: int) -> np.ndarray:
@@ -33,11 +34,7 @@ def element_mask(elements: tuple[int, ...], size: int) -> np.ndarray:
 def check_elements(process: object, elements: tuple[int, ...], size: int | None = None) -> None:
     """Raise UserError unless the elements are distinct indices of an observation of ``size``."""
     name = type(process).__name__
-    whole = isinstance(elements, tuple) and all(
-        isinstance(element, int | np.integer) and not isinstance(element, bool)
-        for element in elements
-    )
-    if not whole:
+    if not isinstance(elements, tuple) or not all(map(is_integer, elements)):
         raise UserError(f"{name}: elements={elements!r} must be a tuple of indices, such as (0, 1)")
     if not elements or len(set(elements)) != len(elements) or min(elements) < 0:
         raise UserError(f"{name}: elements {elements} must be distinct, not negative, at least one")

@@ -12,6 +12,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from rtd3jax.errors import UserError
+from rtd3jax.system.numbers import is_integer
 from rtd3jax.system.pytrees import TypedNode
 
 
@@ -198,7 +199,7 @@ def require(
 def require_whole(process: object, name: str, low: int) -> None:
     """Raise UserError unless field ``name``, which is static, is an integer of at least ``low``."""
     value = getattr(process, name)
-    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+    if not is_integer(value):
         raise UserError(
             f"{type(process).__name__}: {name}={value!r} must be a whole number, written without "
             "a decimal point"
