@@ -33,13 +33,17 @@ matplotlib.use("Agg")
 def quick_studies():
     """Studies end sooner: they draw no pictures, and play few episodes of other policies.
 
-    The ceilings in tables and figures are means of 100 episodes, not of 20,000.
+    The ceilings in tables and figures are means of 100 episodes, not of 20,000, and the
+    pendulum's is computed on a coarse grid: compiled as in tests, the usual one takes minutes.
     """
+    from rtd3jax.envs.pendulum import optimum
     from rtd3jax.study import ceilings, references
     from rtd3jax.study.derive import derive
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ceilings, "ceiling", functools.partial(ceilings.ceiling, episodes=100))
+        coarse = functools.partial(optimum.mean_optimal_return, angles=80, speeds=64)
+        patch.setattr(optimum, "mean_optimal_return", coarse)
         patch.setattr(references, "EPISODES", 2)
         patch.setattr(derive, "__kwdefaults__", {**derive.__kwdefaults__, "pictures": False})
         yield
