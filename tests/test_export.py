@@ -1,6 +1,7 @@
 """Tests of ``python -m rtd3jax.export`` and the policies of a run directory."""
 
 import dataclasses
+import shutil
 
 import jax
 import numpy as np
@@ -62,6 +63,7 @@ def test_a_lane_of_a_run_directory_becomes_a_policy(run):
             "no such cell .* values of disturbance are hidden",
         ),
         ({"env": "pendulum", "seed": 9}, r"no seed 9; its seeds are \[0, 1, 2\]"),
+        ({"env": "pendulum", "seed": True}, "seed must be an integer of at least 0, not True"),
         ({"env": "pendulum", "seed": 2}, "seed 2 is not trained yet"),
         ({"env": "rover", "history_length": 3, "algorithm": "h-td3", "seed": 1}, "was lost .*loss"),
     ],
@@ -69,6 +71,10 @@ def test_a_lane_of_a_run_directory_becomes_a_policy(run):
 def test_what_cannot_be_chosen_is_named(run, which, message):
     with pytest.raises(rtd.UserError, match=message):
         rtd.load_policy(run, **which)
+
+
+def test_a_seed_of_a_column_of_floats_is_a_seed(run):
+    assert rtd.load_policy(run, env="pendulum", seed=0.0).observation_size == 2
 
 
 def test_a_lane_for_another_observation_is_refused(tmp_path):
@@ -137,6 +143,12 @@ def test_the_command_reads_a_saved_policy(run, tmp_path, capsys):
     assert main([str(run), "--env", "pendulum", "--format", "policy", "--out", str(saved)]) == 0
     assert main([str(saved), "--format", "numpy"]) == 0
     assert (tmp_path / "p.py").exists()
+    with_hyphens = saved.with_name("my-p.v2.safetensors")
+    shutil.copy(saved, with_hyphens)
+    assert main([str(with_hyphens), "--format", "numpy"]) == 0
+    assert (tmp_path / "my_p.v2.py").exists()
+    assert main([str(with_hyphens), "--format", "onnx"]) == 0
+    assert (tmp_path / "my-p.v2.onnx").exists()
     capsys.readouterr()
     assert main([str(saved), "--format", "onnx", "--seed", "0"]) == 2
     assert "p.safetensors is not a run directory: seed cannot choose a lane" in (

@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Sequence
+from pathlib import Path
 
 from rtd3jax.cli.common import exit_status, out_path, run_parser
 from rtd3jax.policies.export.formats import FORMATS
@@ -31,7 +32,7 @@ def _run(options: argparse.Namespace) -> int:
         disturbance=options.disturbance,
         history_length=options.history_length,
     )
-    path = out_path(options.out) or user_path(_default_name(policy, options))
+    path = out_path(options.out) or _default_path(policy, options)
     if options.format == POLICY:
         policy.save(path, overwrite=options.force)
     else:
@@ -44,13 +45,15 @@ def _run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _default_name(policy: Policy, options: argparse.Namespace) -> str:
+def _default_path(policy: Policy, options: argparse.Namespace) -> Path:
     suffix = ".safetensors" if options.format == POLICY else FORMATS[options.format][0]
     if user_path(options.run).is_dir():
-        stem = f"{policy.algorithm}_l{int(policy.history_length)}_seed-{options.seed or 0}"
-        # Python imports a module by name only if the name is an identifier.
-        return (stem.replace("-", "_") if suffix == ".py" else stem) + suffix
-    return str(user_path(options.run).with_suffix(suffix))
+        path = Path(f"{policy.algorithm}_l{int(policy.history_length)}_seed-{options.seed or 0}")
+    else:
+        path = user_path(options.run).with_suffix("")
+    # Python imports a module by name only if the name is an identifier.
+    stem = path.name.replace("-", "_") if suffix == ".py" else path.name
+    return path.with_name(stem + suffix)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -69,7 +72,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--out",
         metavar="FILE",
-        help="the file to write [AGENT_lL_seed-N.SUFFIX in the working directory]",
+        help="the file to write [AGENT_lL_seed-N.SUFFIX in the working directory; for a policy's "
+        "file, its own name with another suffix]",
     )
     parser.add_argument("--force", action="store_true", help="replace the file if it exists")
     return parser

@@ -43,7 +43,7 @@ def run_in_gymnasium(
         return _play(policy, gym_env, int(episodes), int(seed))
     try:
         env = gymnasium.make(gym_env)
-    except (gymnasium.error.Error, ImportError) as error:
+    except (gymnasium.error.Error, ImportError, ValueError) as error:
         raise UserError(f"Gymnasium cannot make {gym_env!r}: {short_reason(error)}") from error
     try:
         return _play(policy, env, int(episodes), int(seed))

@@ -1,5 +1,8 @@
 """Policies that need no training; tables compare trained agents with them."""
 
+import dataclasses
+import math
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -17,6 +20,12 @@ class ConstantPolicy:
     """A policy that always returns the same action [A]."""
 
     action: jax.Array
+
+    def with_action_shape(self, shape: tuple[int, ...]) -> "ConstantPolicy":
+        """The policy, whose action gets ``shape`` if it has as many elements."""
+        if self.action.size != math.prod(shape):
+            return self
+        return dataclasses.replace(self, action=self.action.reshape(shape))
 
     def init(self, key: jax.Array | None = None) -> tuple:
         """The policy has no state."""

@@ -1,6 +1,5 @@
 """Checks that a policy fits an environment."""
 
-import dataclasses
 import warnings
 from typing import Any
 
@@ -8,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rtd3jax.errors import UserError
+from rtd3jax.errors import UserError, short_reason
 from rtd3jax.protocols import PolicyLike
 
 
@@ -29,11 +28,12 @@ def check_compatible(
         high: highest action; any shape with the same number of elements.
 
     Raises:
-        UserError: if ``policy`` is not a policy; naming both shapes, if observations or actions
-            differ.
+        UserError: if ``policy`` is not a policy, or JAX cannot compile it; naming both shapes, if
+            observations or actions differ.
     """
     if not (callable(getattr(policy, "init", None)) and callable(getattr(policy, "step", None))):
         raise UserError(f"{type(policy).__name__} is not a policy: it needs init and step")
+    _check_compilable(policy)
     remedy = "use the policy in the kind of environment that it was made for"
     expected = getattr(policy, "observation_size", observation_size)
     if expected != observation_size:
@@ -50,16 +50,23 @@ def check_compatible(
 
 
 def fitted(policy: PolicyLike, action_shape: tuple[int, ...]) -> Any:
-    """``policy``; flat actions that are constant, or of a function, get the environment's shape."""
+    """``policy``, with actions of the environment's shape if it has ``with_action_shape``."""
     if callable(reshaped := getattr(policy, "with_action_shape", None)):
         return reshaped(action_shape)
-    constant = getattr(policy, "action", None)
-    if not isinstance(constant, jax.Array) or constant.shape == action_shape:
-        return policy
-    if not dataclasses.is_dataclass(policy) or constant.size != int(np.prod(action_shape)):
-        return policy
-    changed: Any = policy
-    return dataclasses.replace(changed, action=constant.reshape(action_shape))
+    return policy
+
+
+def _check_compilable(policy: PolicyLike) -> None:
+    """Raise UserError unless JAX can pass the policy to a compiled function."""
+    if isinstance(policy, type):
+        raise UserError(f"{policy.__name__} is a class; pass an instance of it")
+    try:
+        jax.eval_shape(lambda _: None, policy)
+    except TypeError as error:
+        raise UserError(
+            f"{type(policy).__name__} cannot be compiled; make it a flax.struct.dataclass: "
+            f"{short_reason(error)}"
+        ) from error
 
 
 def _action_shape(policy: PolicyLike, observation_size: int) -> tuple[int, ...] | None:

@@ -69,20 +69,24 @@ def compare_runs(
 def differing_settings(
     directories: Sequence[RunDirectory], names: Sequence[str], table: pd.DataFrame
 ) -> list[str]:
-    """A text for each setting, and each plant, in which runs differ in the cells of ``table``."""
+    """A text for each setting, and each plant, in which runs differ in the cells of ``table``.
+
+    A cell is compared with the same cell of the other runs, since cells of one run may have
+    different settings.
+    """
     wanted = set(table[list(CELL)].itertuples(index=False, name=None))
-    found: dict[str, dict[str, list[str]]] = {}
+    found: dict[str, dict[tuple[Any, ...], dict[str, str]]] = {}
     shown = set()
     for name, directory in zip(names, directories, strict=True):
         for cell in directory.cells:
-            if tuple(cell.key[column] for column in CELL) in wanted:
+            key = tuple(cell.key[column] for column in CELL)
+            if key in wanted:
                 shown.add(plant_name(cell))
                 for field, value in {
                     **cell.to_dict(),
                     "final episodes": directory.episodes,
                 }.items():
-                    values = found.setdefault(field, {}).setdefault(name, [])
-                    values += [str(value)] if str(value) not in values else []
+                    found.setdefault(field, {}).setdefault(key, {})[name] = str(value)
     plants = [directory.known_plants() for directory in directories]
     first = {name: plant for name, plant in plants[0].items() if name in shown}
     changed = [
@@ -91,10 +95,26 @@ def differing_settings(
         for text in differing_plants(first, own)
     ]
     return changed + [
-        f"{field}: " + ", ".join(f"{' or '.join(own)} ({name})" for name, own in values.items())
-        for field, values in found.items()
-        if len({tuple(own) for own in values.values()}) > 1 and field not in CELL
+        text
+        for field, cells in found.items()
+        if field not in CELL
+        for text in _differences(field, cells)
     ]
+
+
+def _differences(field: str, cells: dict[tuple[Any, ...], dict[str, str]]) -> list[str]:
+    """A text for each combination of different values that a field of ``cells`` has in runs."""
+    alike: dict[tuple[tuple[str, str], ...], list[tuple[Any, ...]]] = {}
+    for cell, values in cells.items():
+        if len(set(values.values())) > 1:
+            alike.setdefault(tuple(values.items()), []).append(cell)
+    texts = []
+    for values, own in alike.items():
+        agents = dict.fromkeys(cell[CELL.index("algorithm")] for cell in own)
+        some = f" ({len(own)} of {len(cells)} cells: {', '.join(agents)})"
+        where = some if len(own) < len(cells) else ""
+        texts.append(f"{field}{where}: " + ", ".join(f"{value} ({run})" for run, value in values))
+    return texts
 
 
 def comparison_markdown(

@@ -31,7 +31,7 @@ from rtd3jax.study.status import ledger
 from rtd3jax.study.tables import current_tables
 from rtd3jax.system.files import user_path
 from rtd3jax.system.interrupts import terminable
-from rtd3jax.system.numbers import check_counts
+from rtd3jax.system.numbers import check_count, check_counts
 from rtd3jax.training.arguments import check_checkpoints, check_seeds, check_strategy
 from rtd3jax.training.devices import workers
 
@@ -157,13 +157,18 @@ class Study:
         """The trained policy of a lane.
 
         Raises:
-            UserError: when the study has no such cell, or has it with other settings; when the lane
-                has not ended, or was lost.
+            UserError: when the study has no such seed or cell, or has the cell with other
+                settings; when the lane has not ended, or was lost.
         """
         if not isinstance(cell, Cell):
             raise UserError(f"a study consists of rtd.Cell, not {type(cell).__name__}")
         self._directory.contents.check_cell(self.path, cell)
-        return self._directory.lanes.policy(cell, seed)
+        check_count("seed", seed, 0)
+        if seed not in self._directory.seeds:
+            raise UserError(
+                f"{self.path} has no seed {seed}; its seeds are {self._directory.seeds}"
+            )
+        return self._directory.lanes.policy(cell, int(seed))
 
 
 def _distinct(cells: Iterable[Cell]) -> list[Cell]:

@@ -92,7 +92,7 @@ def collect(
         returns.append(curve)
         true_returns.append(true_curve)
         metrics.append(metric_curves(config, state, failure))
-        policies.append(None if failure else job.program.policy(job.lane, state))
+        policies.append(None if failure else _own_policy(job, state))
         failures += [failure] if failure else []
     return Run(
         config,
@@ -104,6 +104,15 @@ def collect(
         {name: np.stack([lane[name] for lane in metrics]) for name in metrics[0]},
         tuple(policies),
     )
+
+
+def _own_policy(job: Job, state: LaneState) -> Policy:
+    """The policy of a lane, with a window of its own length, as if it was saved and loaded.
+
+    A program of lanes with several history lengths has the longest window.
+    """
+    policy = job.program.policy(job.lane, state)
+    return dataclasses.replace(policy, window_tokens=int(policy.history_length))
 
 
 def failure_of(seed: int, state: LaneState) -> Failure | None:

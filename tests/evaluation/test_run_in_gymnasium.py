@@ -94,6 +94,7 @@ def test_a_recurrent_policy_plays_with_its_window():
     ("arguments", "match"),
     [
         ((Swing(), "Pendulum-v9"), "Gymnasium cannot make 'Pendulum-v9'"),
+        ((Swing(), "Pendulum v1:::"), "Gymnasium cannot make 'Pendulum v1:::'"),
         ((Swing(), "CartPole-v1"), "needs a Box"),
         ((Swing(), "MountainCarContinuous-v0"), "expects 3 observation elements"),
         ((rtd.constant_policy([0.0, 0.0]), "Pendulum-v1"), r"shape \(2,\)"),

@@ -4,11 +4,14 @@ import warnings
 
 import gymnasium
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from flax import struct
 from random_policies import random_policy
 
 import rtd3jax as rtd
+from rtd3jax.envs.controllers.lqr import LinearPolicy
+from rtd3jax.policies.compatibility import fitted
 from rtd3jax.study.report.playback import record_episodes
 
 CAR, ROVER, PENDULUM = "MountainCarContinuous-v0", "rover", "pendulum"
@@ -62,6 +65,38 @@ def test_other_bounds_are_said():
         warnings.simplefilter("error")
         own = rtd.make(PENDULUM, max_torque=1.0, max_steps_in_episode=1)
         rtd.evaluate(policy, own, episodes=1)
+
+
+class Plain:
+    """A user's controller that is not a dataclass of flax."""
+
+    def init(self, key=None):
+        return ()
+
+    def step(self, state, observation):
+        return observation[:1], state
+
+
+@pytest.mark.parametrize("meeting", MEETINGS)
+@pytest.mark.parametrize(
+    ("policy", "match"),
+    [
+        (Plain(), "Plain cannot be compiled; make it a flax.struct.dataclass"),
+        (Own, "Own is a class; pass an instance of it"),
+    ],
+)
+def test_a_policy_that_cannot_be_compiled_is_named(policy, match, meeting):
+    with pytest.raises(rtd.UserError, match=match):
+        MEETINGS[meeting](policy, rtd.make(PENDULUM))
+
+
+def test_a_regulator_gets_the_shape_of_the_actions():
+    """It has a field ``action``, too, which is only the equilibrium's part of its actions."""
+    two = jnp.ones(2)
+    policy = LinearPolicy(jnp.ones((2, 3)), jnp.zeros(3), 0 * two, -two, two, (2, 1), 3)
+    assert fitted(policy, (2, 1)) is policy
+    constant = fitted(rtd.constant_policy([0.5, 0.0]), (2, 1))
+    np.testing.assert_array_equal(constant.action, [[0.5], [0.0]])
 
 
 def test_what_is_no_policy_is_named():

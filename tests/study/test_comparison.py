@@ -2,6 +2,7 @@
 
 import re
 import sys
+import types
 
 import numpy as np
 import pandas as pd
@@ -9,9 +10,10 @@ import pytest
 from random_policies import random_policy
 from scipy import stats
 
+import rtd3jax as rtd
 from rtd3jax import compare as command
-from rtd3jax.study.cells import Grid, make_cells
-from rtd3jax.study.comparison import compare_runs
+from rtd3jax.study.cells import Cell, Grid, make_cells
+from rtd3jax.study.comparison import compare_runs, differing_settings
 from rtd3jax.study.derive import derive
 from rtd3jax.study.plants import differing_plants
 from rtd3jax.study.rundir import RunDirectory
@@ -105,6 +107,31 @@ def test_the_command_prints_and_keeps_the_table(runs, tmp_path, capsys):
     assert table["mean"].tolist() == [1.0, 2.0] and np.isnan(table["difference"][0])
     assert command.main([runs["before"], runs["after"], "--true-return"]) == 0
     assert "| td3 | 0 | a/run | 3 | 11 [10, 12] |" in capsys.readouterr().out
+
+
+def test_settings_are_compared_cell_by_cell():
+    """Cells of one run may have different settings, and come in any order."""
+    names = ["a", "b", "c"]
+    steps = {"td3": (200, 200, 200), "lstm-td3": (200, 400, None), "h-td3": (400, 400, 400)}
+    directories = [
+        types.SimpleNamespace(
+            cells=[
+                Cell("rover", "none", rtd.Config(algorithm=agent, total_steps=own[run]))
+                for agent, own in list(steps.items())[:: -1 if run else 1]
+                if own[run]
+            ],
+            episodes=2,
+            known_plants=dict,
+        )
+        for run in range(3)
+    ]
+    table = pd.DataFrame([cell.key for cell in directories[0].cells])
+    found = differing_settings(directories, names, table)
+    where = "(1 of 3 cells: lstm-td3)"
+    assert found == [
+        f"total_steps {where}: 200 (a), 400 (b)",
+        f"replay_capacity {where}: 200 (a), 400 (b)",
+    ]
 
 
 def test_runs_of_another_plant_with_the_same_name_differ():

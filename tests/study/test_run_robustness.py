@@ -14,6 +14,7 @@ from rtd3jax import stress
 from rtd3jax.envs.description import Ceiling
 from rtd3jax.study import ceilings
 from rtd3jax.study.cells import Grid
+from rtd3jax.study.report.page import page_data
 from rtd3jax.study.robustness import over_seeds
 from rtd3jax.study.rundir import RunDirectory
 
@@ -139,3 +140,18 @@ def test_a_lost_lane_does_not_stop_the_others(run, tmp_path, capsys):
     assert "seed 0 was lost in training: the critic loss is NaN" in capsys.readouterr().out
     table = pd.read_parquet(tmp_path / "run" / "robustness.parquet")
     assert len(table) == 3 * 2  # three lanes; 2 and 2.0 are one value
+
+
+def test_a_damaged_lane_does_not_take_the_others_from_the_page(run, tmp_path):
+    shutil.copytree(run, tmp_path / "run")
+    directory = RunDirectory.open(tmp_path / "run")
+    damaged = directory.lanes.lane_path(directory.cells[0], 1)
+    damaged.write_bytes(damaged.read_bytes()[:-1])
+    data = page_data(directory, complete=False, playback=False)
+    assert [(entry["cell"], entry["stress"]) for entry in data["robustness"]] == [
+        (0, "slip"),
+        (0, "delay"),
+        (1, "slip"),
+        (1, "delay"),
+    ]
+    assert any(damaged.name in note for note in data["notes"])

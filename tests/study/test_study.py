@@ -172,6 +172,8 @@ def test_a_policy_of_a_cell_with_other_settings_is_refused(tmp_path):
         study.policy(dataclasses.replace(cell, config=longer), 1)
     with pytest.raises(rtd.UserError, match="consists of rtd.Cell, not str"):
         study.policy("td3", 1)
+    with pytest.raises(rtd.UserError, match=r"run has no seed 9; its seeds are \[0, 1\]"):
+        study.policy(cell, 9)
 
 
 @pytest.mark.parametrize("how", ["study", "sweep"])

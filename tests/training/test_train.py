@@ -156,7 +156,9 @@ def test_lengths_side_by_side_equal_exact_windows():
     groups = make_groups(cell_jobs(cells, [0], "vmap"), "vmap", 1)
     assert len(groups) == 1
     advance_groups(groups, lambda group: None)
-    for (_, state), config in zip(groups[0].lanes(), configs, strict=True):
+    for (job, state), config in zip(groups[0].lanes(), configs, strict=True):
+        policy = collect(config, [0], {0: (job, state)}).policy(0)
+        assert policy.window_tokens == config.history_length
         exact = make_groups(cell_jobs([Cell("rover", "ar1-slip", config)], [0], "map"), "map", 1)
         advance_groups(exact, lambda group: None)
         run = collect(config, [0], {0: next(iter(exact[0].lanes()))})

@@ -1,5 +1,7 @@
 """Reads the tables that some commands add to a run, for the page."""
 
+import contextlib
+import itertools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -13,13 +15,12 @@ from rtd3jax.system.parquet import read_parquet
 
 def policies_of(directory: RunDirectory) -> set[str]:
     """The digests of the files of the lanes whose policies can be tested."""
-    lanes = directory.lanes
-    return {
-        lanes.digest(cell, seed)
-        for cell in directory.cells
-        for seed in directory.seeds
-        if lanes.is_done(cell, seed) and not lanes.is_lost(cell, seed)
-    }
+    lanes, found = directory.lanes, set()
+    for cell, seed in itertools.product(directory.cells, directory.seeds):
+        with contextlib.suppress(UserError):  # a damaged file, of which the page has a note
+            if lanes.is_done(cell, seed) and not lanes.is_lost(cell, seed):
+                found.add(lanes.digest(cell, seed))
+    return found
 
 
 def of_these_policies(
