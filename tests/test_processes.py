@@ -217,18 +217,25 @@ def test_threads_unless_processes_are_asked_for(monkeypatch):
     for threads in (process_plan.shares_of(1, jobs, "map"), process_plan.shares_of(2, [], "map")):
         assert threads.processes == 1 and "a thread per core" in str(threads)
     two = process_plan.shares_of(2, jobs, "map")
-    assert two.cores == ((4,), (6,)) and two.lanes == 1 and "2 processes, each pinned" in str(two)
-    assert process_plan.shares_of(2, jobs[:1], "map").processes == 1
+    assert two.cores == ((4,), (6,)) and two.lanes == 1
+    assert str(two) == "2 processes, each pinned to 1 core"
     monkeypatch.setattr(process_plan, "memory_limit", lambda: 2**20)
     with pytest.raises(UserError, match="GiB"):
         process_plan.shares_of(2, jobs, "map")
 
 
-def test_all_cores_are_divided(monkeypatch):
+def test_a_lane_has_as_many_cores_however_many_lanes_wait(monkeypatch):
+    """Its bits depend on them, and a repeated command has fewer lanes left."""
     monkeypatch.setattr(process_plan, "cores", lambda: 5)
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {1, 2, 3, 5, 8})
-    shares = process_plan._divided(2)
-    assert shares.cores == ((1, 2), (3, 5, 8)) and shares.lanes == 3
+    monkeypatch.setattr(process_plan, "memory_limit", lambda: 16 * 2**30)
+    jobs = lanes_of(6)
+    for waiting, lanes in ((6, 2), (3, 2), (2, 1)):
+        shares = process_plan.shares_of(2, jobs[:waiting], "map")
+        assert shares.cores == ((1, 2), (3, 5)) and shares.lanes == lanes
+    one = process_plan.shares_of(2, jobs[:1], "map")
+    assert one.cores == ((1, 2),) and not one.here
+    assert str(one) == "1 process, pinned to 2 cores"
 
 
 def test_rows_of_processes_that_write_at_the_same_time_are_of_one_session(tmp_path):

@@ -1,5 +1,6 @@
 """Tests of the sweep's command: its files, its errors, and its continuation."""
 
+import errno
 import json
 import math
 from types import SimpleNamespace
@@ -17,9 +18,11 @@ from rtd3jax.envs import registry
 from rtd3jax.errors import UserError
 from rtd3jax.study import finish, interim, presets, recorder, references, time_estimate
 from rtd3jax.study.cells import Cell, Grid, bar_labels, make_cells
+from rtd3jax.study.log import read_log
 from rtd3jax.study.presets import PRESETS
 from rtd3jax.study.results import CURVES, EPISODES, read_table
 from rtd3jax.training import lanes
+from rtd3jax.training.checkpoint import Checkpoints
 
 TINY = [
     *("--env", "rover", "--disturbances", "ar1-slip", "--algorithms", "td3", "lstm-td3-1ha1hc"),
@@ -130,6 +133,8 @@ def test_a_lost_lane_is_reported_and_the_exit_status_says_so(tmp_path, capsys):
         ("--preset quick --dry-run --checkpoint-every banana", "'banana' is not like 300s"),
         ("--preset quick --import ./tank.py", "give a module's name: --import tank"),
         ("--preset quick --import=", "--import '': Empty module name"),
+        ("--preset quick --cluster=", "--cluster is empty: name an address"),
+        ("--preset quick --start=", "--start is empty: name a run"),
         ("--preset quick --seed 3", "unrecognized arguments: --seed 3"),
         ("--preset quick --fresh --shard 1/2", "rename it once, then start them without --fresh"),
     ],
@@ -399,8 +404,6 @@ def test_tables_that_fail_during_a_study_do_not_stop_it(tmp_path, monkeypatch, c
 
 
 def test_a_full_disk_is_one_line_and_loses_nothing(tmp_path, monkeypatch, capsys):
-    import errno
-
     from rtd3jax.system import files
 
     real, written = files.os.fsync, []
@@ -423,6 +426,43 @@ def test_a_full_disk_is_one_line_and_loses_nothing(tmp_path, monkeypatch, capsys
     assert sweep.main([*TINY, "--out", str(out)]) == 0
     assert f"{len(kept)} of 4 lanes have ended already" in capsys.readouterr().out
     assert all(file.read_bytes() == content for file, content in kept.items())
+
+
+def test_rows_of_the_log_wait_for_a_disk_that_was_full(tmp_path, monkeypatch):
+    real, calls = recorder.append_rows, []
+
+    def full_at_first(path, rows):
+        calls.append(list(rows))
+        if len(calls) < 4:
+            path.open("a").write('{"env": ')  # a part of a line
+            raise OSError(errno.ENOSPC, "No space left on device")
+        real(path, rows)
+
+    monkeypatch.setattr(recorder, "append_rows", full_at_first)
+    out = tmp_path / "run"
+    with pytest.warns(UserWarning, match="log.jsonl cannot be written: No space left") as warned:
+        assert sweep.main([*TINY, "--out", str(out)]) == 0
+    assert len([one for one in warned if "log.jsonl" in str(one.message)]) == 1
+    rows = read_log(out / "log.jsonl")
+    assert {(row["algorithm"], row["seed"], row["step"]) for row in rows} == {
+        (algorithm, seed, step)
+        for algorithm in ("td3", "lstm-td3-1ha1hc")
+        for seed in (0, 1)
+        for step in (30, 60)
+    }
+
+
+def test_a_checkpoint_that_was_to_be_kept_and_cannot_be_written_costs_no_result(
+    tmp_path, monkeypatch
+):
+    def full(*_, **__):
+        raise UserError("checkpoint in x cannot be written: No space left on device")
+
+    monkeypatch.setattr(Checkpoints, "save_lane", full)
+    out = tmp_path / "run"
+    with pytest.warns(UserWarning, match="No space left on device; the result is written without"):
+        assert sweep.main([*TINY, "--keep-checkpoints", "--out", str(out)]) == 0
+    assert len(list(out.glob("lanes/**/*.safetensors"))) == 4
 
 
 def test_a_module_that_registers_environments_can_be_imported(tmp_path, monkeypatch, capsys):

@@ -21,7 +21,7 @@ from rtd3jax.cli.common import exit_status
 from rtd3jax.errors import UserError
 from rtd3jax.study.cells import make_cells
 from rtd3jax.study.cluster import check_absolute_starts, train_on_cluster
-from rtd3jax.study.execute import Work, train_here, waiting_jobs
+from rtd3jax.study.execute import Work, planned_jobs, train_here, waiting_jobs
 from rtd3jax.study.hosts import own_shard, own_share, relaunch
 from rtd3jax.study.lane_files import check_names
 from rtd3jax.study.lock import parse_shard, writer
@@ -32,7 +32,7 @@ from rtd3jax.study.process_plan import Shares, shares_of
 from rtd3jax.study.processes import train_in_processes
 from rtd3jax.study.run import Trainer, run_study
 from rtd3jax.study.rundir import RunDirectory, holds_study
-from rtd3jax.study.starts import check_starts_stay, planned_jobs
+from rtd3jax.study.starts import check_starts_stay
 from rtd3jax.study.status import ledger
 from rtd3jax.system.imports import import_modules
 from rtd3jax.system.interrupts import Terminated, terminable
@@ -109,6 +109,10 @@ def _plan(options: argparse.Namespace) -> _Plan:
     episodes = sweep_options.count("final_episodes", options.final_episodes)
     strategy = check_strategy(options.strategy)
     check_loggers(options.log)
+    if options.cluster == "":
+        raise UserError("--cluster is empty: name an address (host:port) or auto, or leave it out")
+    if options.start == "":
+        raise UserError("--start is empty: name a run or a policy's file, or leave it out")
     processes = sweep_options.count("processes", options.processes)
     if sum(map(bool, (*_divided(options), processes > 1))) > 1:
         raise UserError(
@@ -211,7 +215,7 @@ def _trainer(options: argparse.Namespace, shares: Shares, handles: list[int]) ->
     if options.cluster:
         where = {"address": options.cluster, "imports": options.imports}
         return functools.partial(train_on_cluster, **where)
-    if shares.processes == 1:
+    if shares.here:
         return train_here
     where = {"shares": shares, "imports": options.imports, "handles": handles}
     return functools.partial(train_in_processes, **where)

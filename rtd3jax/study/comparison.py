@@ -109,11 +109,12 @@ def _differences(field: str, cells: dict[tuple[Any, ...], dict[str, str]]) -> li
         if len(set(values.values())) > 1:
             alike.setdefault(tuple(values.items()), []).append(cell)
     texts = []
-    for values, own in alike.items():
+    for combination, own in alike.items():
         agents = dict.fromkeys(cell[CELL.index("algorithm")] for cell in own)
         some = f" ({len(own)} of {len(cells)} cells: {', '.join(agents)})"
         where = some if len(own) < len(cells) else ""
-        texts.append(f"{field}{where}: " + ", ".join(f"{value} ({run})" for run, value in values))
+        listed = ", ".join(f"{value} ({run})" for run, value in combination)
+        texts.append(f"{field}{where}: {listed}")
     return texts
 
 

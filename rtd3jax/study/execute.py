@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 
+from rtd3jax.errors import UserError
 from rtd3jax.study.cells import bar_labels
 from rtd3jax.study.derive import Reference
 from rtd3jax.study.interim import InterimResults
@@ -100,6 +101,30 @@ def train_here(
             watch(group)
 
         advance_groups(groups, on_chunk, checkpoints, devices)
+
+
+def planned_jobs(directory: RunDirectory, strategy: str, *, fresh: bool = False) -> list[Job]:
+    """A job with its start for each lane of the study; nothing is written.
+
+    Raises:
+        UserError: as `add_starts` does, or when a lane that gets more steps cannot continue from
+            its checkpoint. Once the study is extended, the lanes that ended before count as
+            unfinished, and the tables do not have them any more.
+    """
+    jobs = directory.jobs(strategy)
+    add_starts(directory, jobs, write=False, fresh=fresh)
+    longer = [] if fresh else directory.longer()
+    checkpoints = checkpoints_of(directory, (None, None))
+    for job in jobs:
+        if job.cell in longer:
+            try:
+                checkpoints.check(job, whole=True)
+            except UserError as error:
+                raise UserError(
+                    f"--out {directory.path}: {job.cell.words} seed {job.seed} cannot continue to "
+                    f"{job.cell.config.total_steps:,} steps: {error}"
+                ) from error
+    return jobs
 
 
 def waiting_jobs(directory: RunDirectory, jobs: Sequence[Job]) -> list[Job]:

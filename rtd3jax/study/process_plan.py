@@ -17,6 +17,7 @@ class Shares:
 
     Attributes:
         cores: the cores of each process, to which it is pinned; empty where the system cannot pin.
+            All processes have the same number, since rounding depends on it.
         lanes: largest number of lanes that a process trains at a time: one for each of its cores,
             but at most its share of the lanes.
     """
@@ -26,20 +27,29 @@ class Shares:
 
     @property
     def processes(self) -> int:
-        """Number of processes; with one, this process trains the lanes with threads."""
+        """Number of processes."""
         return len(self.cores)
 
+    @property
+    def here(self) -> bool:
+        """Whether this process trains the lanes, with threads."""
+        return self.cores == ((),)
+
     def __str__(self) -> str:
-        if self.processes == 1:
+        if self.here:
             return "one process with a thread per core"
-        pinned = ", each pinned to its share of the cores" if self.cores[0] else ""
-        return f"{self.processes} processes{pinned}"
+        count, own = self.processes, len(self.cores[0])
+        each = "each " * (count > 1)
+        pinned = f", {each}pinned to {own} core{'s' * (own > 1)}" if own else ""
+        return f"{count} process{'es' * (count > 1)}{pinned}"
 
 
 def shares_of(processes: int, jobs: Sequence[Job], strategy: str) -> Shares:
     """The division of the cores among ``processes``, for the lanes that wait.
 
-    There are never more processes than lanes.
+    There are never more processes than lanes. The cores are divided by the number that the user
+    wants, also if fewer lanes wait: a lane then has the same bits however many lanes wait beside
+    it. Cores that are left over stay idle.
 
     Args:
         processes: the number that the user wants.
@@ -60,36 +70,28 @@ def shares_of(processes: int, jobs: Sequence[Job], strategy: str) -> Shares:
         raise UserError(
             f"--processes {processes}: this process may use {cores()} cores; give at most as many"
         )
-    count = min(processes, len(jobs))
-    if count == 1:
-        return Shares(((),))
-    needed, limit = _bytes(jobs, count), memory_limit()
+    needed, limit = _bytes(jobs, processes), memory_limit()
     if needed > limit:
-        # Fewer processes train as many lanes at a time; one process lets lanes wait for memory.
-        fewer = next((n for n in range(count - 1, 1, -1) if _bytes(jobs, n) <= limit), 1)
+        # Fewer processes need less; one process lets lanes wait for memory.
+        fewer = next((n for n in range(processes - 1, 1, -1) if _bytes(jobs, n) <= limit), 1)
         raise UserError(
             f"--processes {processes} needs {needed / 2**30:,.1f} GiB, but there are only "
             f"{limit / 2**30:,.1f}; use --processes {fewer}, or lower replay_capacity, "
             "hidden_size, batch_size or history_length"
         )
-    return _shared(count, jobs)
+    return _shared(processes, jobs)
 
 
 def _bytes(jobs: Sequence[Job], processes: int) -> int:
-    return processes_bytes(jobs, processes, _shared(processes, jobs).lanes)
+    shares = _shared(processes, jobs)
+    return processes_bytes(jobs, shares.processes, shares.lanes)
 
 
 def _shared(processes: int, jobs: Sequence[Job]) -> Shares:
-    """The division of all cores among the processes, without room for more lanes than there are."""
-    shares = _divided(processes)
-    return dataclasses.replace(shares, lanes=min(shares.lanes, -(-len(jobs) // processes)))
-
-
-def _divided(processes: int) -> Shares:
-    count = cores()
+    """Equal shares of the cores, without room for more lanes than there are."""
+    count, each = min(processes, len(jobs)), cores() // processes
+    lanes = min(each, -(-len(jobs) // count))
     if not hasattr(os, "sched_getaffinity"):
-        return Shares(((),) * processes, -(-count // processes))
+        return Shares(((),) * count, lanes)
     own = sorted(os.sched_getaffinity(0))  # neighbours often share a cache
-    ends = [count * place // processes for place in range(processes + 1)]
-    shares = (tuple(own[a:b]) for a, b in zip(ends, ends[1:], strict=False))
-    return Shares(tuple(shares), -(-count // processes))
+    return Shares(tuple(tuple(own[each * n : each * (n + 1)]) for n in range(count)), lanes)

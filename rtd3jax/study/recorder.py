@@ -2,13 +2,15 @@
 
 import math
 import time
+import warnings
+from typing import Any
 
 import numpy as np
 
-from rtd3jax.errors import short_reason
+from rtd3jax.errors import UserError, short_reason
 from rtd3jax.evaluation.returns import both_returns
 from rtd3jax.study.interim import InterimResults
-from rtd3jax.study.log import LOG, LoggedReturns, append_rows
+from rtd3jax.study.log import LOG, LoggedReturns, append_rows, repair_log
 from rtd3jax.study.loggers import Logger
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.training.checkpoint import Checkpoints
@@ -46,6 +48,8 @@ class Recorder:
         self._logger = logger
         self._logged: dict[int, int] = {}
         self._failed: set[int] = set()
+        self._unwritten: list[dict[str, Any]] = []
+        """Rows of the log that could not be written yet."""
         self._there = (logged or LoggedReturns(directory.path / LOG)).update()
         self._began = time.perf_counter() if began is None else began
         self._complaints = complaints
@@ -65,12 +69,12 @@ class Recorder:
         if group.finished and group.state is not None:
             for job, state in group.lanes():
                 stays = self._keep_checkpoints and int(state.failure) == HEALTHY
-                if stays:  # first, so that no lane has a file but no checkpoint
-                    self._checkpoints.save_lane(job, state, group.step, kept=1)
+                # First, so that no lane has a file but no checkpoint.
+                saved = stays and self._saved(job, state, group.step)
                 try:
                     final = self._final_returns(job, state)
                 except Exception as error:  # too many episodes for the memory, for example
-                    if not stays:
+                    if not saved:
                         self._checkpoints.save_lane(job, state, group.step, kept=1)
                     why = short_reason(error)
                     self._note_failure(job, f"its final evaluation: {why}; its training is kept")
@@ -81,6 +85,15 @@ class Recorder:
             group.state = None  # frees the replay
             if self._interim is not None:
                 self._interim.refresh()
+
+    def _saved(self, job: Job, state: LaneState, step: int) -> bool:
+        """Write the last checkpoint of a lane; a full disk does not end the training."""
+        try:
+            self._checkpoints.save_lane(job, state, step, kept=1)
+        except UserError as error:
+            warnings.warn(f"{error}; the result is written without it", stacklevel=2)
+            return False
+        return True
 
     def _log(self, group: Group) -> None:
         # A worker may be writing the curves and then the step, which is therefore read first.
@@ -114,7 +127,27 @@ class Recorder:
                 if self._logger is not None:
                     self._logger.log(cell, seed, row)
             self._logged[id(job)] = reached
-        append_rows(self._directory.path / LOG, rows)
+        self._append(rows)
+
+    def _append(self, rows: list[dict[str, Any]]) -> None:
+        """Append rows to the log; on a full disk they wait for the next attempt, with a warning."""
+        path, waited = self._directory.path / LOG, self._unwritten
+        self._unwritten = [*waited, *rows]
+        if not self._unwritten:
+            return
+        try:
+            if waited:
+                repair_log(path)  # the failed write may have left a part of a line
+            append_rows(path, self._unwritten)
+        except OSError as error:
+            if not waited:
+                warnings.warn(
+                    f"{path} cannot be written: {error.strerror}; the training continues, and "
+                    "tries again later",
+                    stacklevel=2,
+                )
+        else:
+            self._unwritten = []
 
     def _note_failure(self, job: Job, reason: str) -> None:
         cell, seed = job.key

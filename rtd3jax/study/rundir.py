@@ -139,6 +139,13 @@ class RunDirectory:
             )
         return "\n".join(news)
 
+    def longer(self) -> list[Cell]:
+        """The cells of the existing study that `prepare` will give more steps."""
+        if not (self.path / CONFIG).exists():
+            return []
+        there = Contents.read(self.path / CONFIG)
+        return [after for _, after in longer_cells(there, self.contents)]
+
     def known_plants(self) -> Plants:
         """The plants with which the study was begun or extended; none in an earlier version."""
         return read_config(self.path / CONFIG).get("plants", {})

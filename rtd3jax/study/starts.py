@@ -13,17 +13,6 @@ from rtd3jax.training.start import Start
 from rtd3jax.training.starts import starts_of_path
 
 
-def planned_jobs(directory: RunDirectory, strategy: str, *, fresh: bool = False) -> list[Job]:
-    """A job with its start for each lane of the study; nothing is written.
-
-    Raises:
-        UserError: as `add_starts` does.
-    """
-    jobs = directory.jobs(strategy)
-    add_starts(directory, jobs, write=False, fresh=fresh)
-    return jobs
-
-
 def add_starts(
     directory: RunDirectory, jobs: Sequence[Job], *, write: bool, fresh: bool = False
 ) -> None:

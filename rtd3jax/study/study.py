@@ -19,14 +19,13 @@ from rtd3jax.errors import UserError
 from rtd3jax.policies.trained import Policy
 from rtd3jax.study.ceilings import ceilings_of
 from rtd3jax.study.cells import Cell
-from rtd3jax.study.execute import Work
+from rtd3jax.study.execute import Work, planned_jobs
 from rtd3jax.study.figures import final_returns, learning_curves
 from rtd3jax.study.loggers import check_loggers
 from rtd3jax.study.memory_plan import lanes_at_once, usable_memory
 from rtd3jax.study.report.page import write_page
 from rtd3jax.study.run import run_study
 from rtd3jax.study.rundir import RunDirectory, holds_study
-from rtd3jax.study.starts import planned_jobs
 from rtd3jax.study.status import ledger
 from rtd3jax.study.tables import current_tables
 from rtd3jax.system.files import user_path

@@ -17,6 +17,7 @@ from typing import Any
 from rtd3jax.errors import UserError
 from rtd3jax.system.files import make_writable, read_arrays, write_arrays
 from rtd3jax.system.jax_settings import jax_settings
+from rtd3jax.system.machine import cores
 from rtd3jax.system.versions import versions_of
 from rtd3jax.training.checkpoint_arrays import extended, from_arrays, to_arrays
 from rtd3jax.training.checkpoint_files import (
@@ -37,7 +38,10 @@ DEFAULT_SECONDS = 300.0
 
 _PATIENCE = 150
 """By default, the time between checkpoints is at least this many times the time that the last one
-took. With five lanes on two cores, checkpoints then take at most 2% of the time."""
+took. With up to six lanes on two cores, checkpoints then take at most 2% of the time."""
+
+_SHARE = 0.02
+"""Largest part of the time of all cores that checkpoints take by default."""
 
 KEPT = 2
 
@@ -70,6 +74,7 @@ class Checkpoints:
         self._written: dict[int, int] = {}
         self._tried: dict[int, tuple[float, int]] = {}
         self._cost: dict[int, float] = {}
+        self._asked: dict[int, Group] = {}
 
     def is_due(self, group: Group) -> bool:
         """Whether the group needs a new checkpoint."""
@@ -77,7 +82,10 @@ class Checkpoints:
         when, step = self._tried.setdefault(id(group), (now, 0))
         seconds = self._seconds
         if seconds is None:
-            seconds = max(DEFAULT_SECONDS, _PATIENCE * self._cost.get(id(group), 0.0))
+            self._asked[id(group)] = group
+            training = sum(not other.finished for other in list(self._asked.values()))
+            patience = max(_PATIENCE, training / (_SHARE * cores()))
+            seconds = max(DEFAULT_SECONDS, patience * self._cost.get(id(group), 0.0))
         by_time = now - when >= seconds
         return by_time or (self._steps is not None and group.step - step >= self._steps)
 
@@ -118,15 +126,30 @@ class Checkpoints:
         for old in [*stale, *unfinished_files(directory)]:
             old.unlink(missing_ok=True)
 
-    def check(self, job: Job) -> None:
+    def check(self, job: Job, *, whole: bool = False) -> None:
         """Raise UserError if the lane's newest checkpoint belongs to another identity.
 
         `restore` raises it too, but in a worker, while other lanes train. Only metadata are read
-        here; damaged files are left to `restore`.
+        here, and damaged files are left to `restore`. With ``whole``, the files are read until one
+        is valid, and it is also an error if none is.
         """
-        newest = newest_metadata(self._directory_of(job))
-        if newest is not None:
-            self._check(*newest, job)
+        directory = self._directory_of(job)
+        if not whole:
+            newest = newest_metadata(directory)
+            if newest is not None:
+                self._check(*newest, job)
+            return
+        complaints = []
+        for file in checkpoint_files(directory):
+            try:
+                _, metadata = read_arrays(file)
+            except UserError as error:
+                complaints.append(str(error))
+                continue
+            self._check(file, metadata, job)
+            return
+        if complaints:
+            raise _none_valid(directory, complaints)
 
     def prepare(self, jobs: Iterable[Job]) -> None:
         """Make the directory of each lane, and raise UserError if it cannot be written."""
@@ -202,10 +225,7 @@ class Checkpoints:
             if first:
                 break
         if complaints and not states:
-            raise UserError(
-                f"{'; '.join(complaints)}; there is no older checkpoint: remove "
-                f"{self._directory_of(job)} to start this lane from the beginning"
-            )
+            raise _none_valid(self._directory_of(job), complaints)
         for complaint in complaints:
             warnings.warn(f"{complaint}; an older checkpoint is used", stacklevel=2)
         return states
@@ -249,6 +269,13 @@ def _each(write: Callable[[Any], None], items: Iterable[Any]) -> None:
             errors.append(error)
     if errors:
         raise errors[0]
+
+
+def _none_valid(directory: Path, complaints: Iterable[str]) -> UserError:
+    return UserError(
+        f"{'; '.join(complaints)}; there is no older checkpoint: remove {directory} to start this "
+        "lane from the beginning"
+    )
 
 
 def _unwritable(directory: Path, error: OSError, remark: str = "") -> UserError:

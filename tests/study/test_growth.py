@@ -17,6 +17,7 @@ from rtd3jax.study.lane_files import cell_name
 from rtd3jax.study.lock import writer
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.system.files import write_bytes_atomically
+from rtd3jax.training import checkpoint
 
 SETTINGS = dict(hidden_size=4, batch_size=4, learning_starts=10, eval_every=30, eval_episodes=1)
 FLAGS = [f"--{name.replace('_', '-')}={value}" for name, value in SETTINGS.items()]
@@ -180,6 +181,34 @@ def test_more_steps_that_cannot_go_on_are_refused_with_what_to_do(tmp_path):
     _finish(_directory(tmp_path / "d"), cell(), failure=lost)
     later = _directory(tmp_path / "d", cell(total_steps=90))
     assert later.lanes.is_done(cell(total_steps=90), 0)  # it would be lost again
+
+
+def test_lanes_whose_checkpoints_are_of_no_use_stay_in_a_study_that_was_not_extended(
+    tmp_path, monkeypatch, capsys
+):
+    """If it was, the ended lanes would leave the tables, and could never go on."""
+    out = tmp_path / "run"
+    assert run(out, "td3", 1, 60) == 0
+    before, config = contents(out), (out / "config.json").read_bytes()
+    (kept,) = out.glob("checkpoints/*/seed-0/*.safetensors")
+    whole = kept.read_bytes()
+
+    def is_refused(message):
+        assert run(out, "td3", 1, 120) == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1 and message in error
+        assert "td3 seed 0 cannot continue to 120 steps" in error
+        assert contents(out) == before and (out / "config.json").read_bytes() == config
+        study = rtd.Study(RunDirectory.open(out).cells, seeds=[0], out=out, final_episodes=2)
+        assert study.policy(study._directory.cells[0], 0).algorithm == "td3"
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "versions", lambda: {"rtd3jax": "9.9.9"})
+        is_refused("belongs to another versions")
+    kept.write_bytes(whole[:-1])
+    is_refused("there is no older checkpoint")
+    kept.write_bytes(whole)
+    assert run(out, "td3", 1, 120) == 0
 
 
 def test_a_default_that_is_given_adds_nothing(tmp_path):

@@ -45,10 +45,13 @@ def test_the_number_of_processes_that_is_named_has_enough_memory(eight_cores, mo
         assert process_plan.shares_of(fewer, jobs, "map").processes == fewer
 
 
-def test_one_lane_needs_no_process(eight_cores, monkeypatch):
-    """So there is no other number of processes to name either."""
-    monkeypatch.setattr(process_plan, "memory_limit", lambda: 2**20)
-    assert process_plan.shares_of(2, lanes_of(1), "map").processes == 1
+def test_the_memory_is_that_of_the_processes_that_start(eight_cores, monkeypatch):
+    """A lane that waits alone needs one process."""
+    jobs = lanes_of(1)
+    monkeypatch.setattr(process_plan, "memory_limit", lambda: processes_bytes(jobs, 1, 1))
+    assert process_plan.shares_of(8, jobs, "map").processes == 1
+    with pytest.raises(UserError, match="use --processes 1, or lower replay_capacity"):
+        process_plan.shares_of(8, lanes_of(2), "map")
 
 
 class Member:

@@ -222,11 +222,14 @@ def test_an_unfinished_run_has_a_page_that_says_so(runs, tmp_path, monkeypatch):
     (hostile / "cluster.jsonl").touch()
     row = {**cell.key, "seed": 1, "step": 20, "return": -1.0, "seconds": 3.0}
     earlier = {**row, "step": 60, "return": 5.0}  # before the lane was trained again
-    (hostile / "log.jsonl").write_text("".join(json.dumps(one) + "\n" for one in (earlier, row)))
+    removed = {**directory.cells[1].key, "seed": 0, "step": 60, "return": 7.0, "seconds": 4.0}
+    rows = earlier, row, removed  # of the last one, the log reaches the end, but there is no file
+    (hostile / "log.jsonl").write_text("".join(json.dumps(one) + "\n" for one in rows))
     data = page_data(directory, complete=True, playback=False)
     assert data["cells"][0]["statuses"]["failed"] == 1 and not data["with_playback"]
-    assert data["timing"] == {"steps": 20, "shards": 0}  # each task has a clock of its own
+    assert data["timing"] == {"steps": 80, "shards": 0}  # each task has a clock of its own
     assert data["cells"][0]["curves"]["return"]["steps"] == [20]
+    assert data["cells"][1]["curves"]["return"] is data["cells"][2]["curves"]["return"] is None
 
 
 def test_a_lane_that_was_copied_from_its_run_is_named(runs, tmp_path):

@@ -393,15 +393,22 @@ def test_typed_keys_survive(tmp_path):
 def test_large_checkpoints_wait_longer_by_default(tmp_path, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(checkpoint.time, "monotonic", lambda: now[0])
-    group = SimpleNamespace(step=1, lanes=lambda: [(None, {"leaf": np.zeros(1)})])
+    monkeypatch.setattr(checkpoint, "cores", lambda: 2)
+
+    def lane(**fields):
+        return SimpleNamespace(
+            step=1, lanes=lambda: [(None, {"leaf": np.zeros(1)})], finished=False, **fields
+        )
 
     def slow_write(*_):
         now[0] += 6.0
 
     monkeypatch.setattr(checkpoint, "write_arrays", slow_write)
-    for seconds, wait in ((None, 900.0), (60.0, 60.0)):
+    # Of 40 lanes, each may take 2% of a twentieth of the time of a core.
+    for seconds, others, wait in ((None, 0, 900.0), (60.0, 0, 60.0), (None, 39, 6_000.0)):
         checkpoints = Checkpoints(lambda job: tmp_path, lambda job: {}, seconds)
-        assert not checkpoints.is_due(group)
+        group, *more = [lane() for _ in range(1 + others)]
+        assert not any(checkpoints.is_due(one) for one in (group, *more))
         checkpoints.save(group)
         now[0] += wait - 1.0
         assert not checkpoints.is_due(group)

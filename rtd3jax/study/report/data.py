@@ -24,6 +24,7 @@ from rtd3jax.study.results import CELL, is_trained, reference_names, rounded_num
 from rtd3jax.study.rundir import RunDirectory
 from rtd3jax.study.statistics import Summary, iqm_bands, reference_mean, summarise, thinned
 from rtd3jax.study.status import ledger
+from rtd3jax.training.checkpoint_files import checkpoint_steps
 
 MEASURES = {"return": "as rewarded", "true_return": "of the true state"}
 
@@ -110,8 +111,20 @@ def _with_log(
                 del rows[lane][step]
             point = {name: row[name] for name in (*key, "step")}
             rows[lane][row["step"]] = {**point, "return": value, "true_return": math.nan}
-    points = [point for own in rows.values() for point in own.values()]
+    cells = {tuple(cell.key.values()): cell for cell in directory.cells}
+    points = [
+        point
+        for (*key, seed), own in rows.items()
+        if not _was_removed(directory, cells[tuple(key)], seed, max(own))
+        for point in own.values()
+    ]
     return pd.concat([curves, pd.DataFrame(points)[curves.columns]]) if points else curves
+
+
+def _was_removed(directory: RunDirectory, cell: Cell, seed: int, step: int) -> bool:
+    """Whether the file of a lane, whose log reaches ``step``, was removed to train it again."""
+    place = directory.lanes.checkpoint_directory(cell, seed)
+    return step >= cell.config.total_steps and not checkpoint_steps(place)
 
 
 def _differs(curves: pd.DataFrame, episodes: pd.DataFrame) -> bool:
