@@ -140,6 +140,20 @@ def test_a_cell_asks_for_cores_and_the_planned_memory():
     assert larger.memory - need.memory > 4 * 20 * 2**20  # four replays
 
 
+def test_a_task_that_asked_for_no_gpu_uses_none(tmp_path, monkeypatch):
+    cells = make_cells([Grid("rover", ("ar1-slip",), ("td3",))], {})
+    RunDirectory.create(tmp_path / "run", cells, [0], 1)
+    monkeypatch.setattr(cluster, "train_here", lambda *_: None)
+    before = jax.config.values["jax_default_device"]
+    try:
+        for strategy, expected in (("vmap", before), ("map", jax.local_devices(backend="cpu")[0])):
+            work = Work(strategy, 1, quiet=True)
+            cluster._train_cell(str(tmp_path / "run"), 0, [0], work, strategy == "map", [])
+            assert jax.config.values["jax_default_device"] == expected
+    finally:
+        jax.config.update("jax_default_device", before)
+
+
 def test_a_cell_that_no_node_can_hold_is_refused():
     with pytest.raises(UserError, match="memory, but the largest node has 1,024 MiB"):
         cluster._need(jobs(replay_capacity=5_000_000), Work("map", 4), nodes())

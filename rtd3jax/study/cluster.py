@@ -21,6 +21,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import jax
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -263,6 +264,9 @@ def _train_cell(
     """On a node: train the lanes of a cell; return the complaints and a row for `TASKS`."""
     began = time.time()
     import_modules(imports)
+    if work.strategy == "map":  # the task asked for no GPU, but may see those of its node
+        with contextlib.suppress(RuntimeError):  # JAX_PLATFORMS excludes the CPU
+            jax.config.update("jax_default_device", jax.local_devices(backend="cpu")[0])
     directory = RunDirectory.open(path)
     cell = directory.cells[index]
     # The jobs of all cells, because under `vmap` the longest window of all determines the program.
