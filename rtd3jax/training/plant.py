@@ -22,15 +22,21 @@ def plant_of(env: EnvironmentLike, params: object) -> dict[str, Any]:
     """The identity of an environment with these parameters, equal in every process.
 
     The identities of two plants with the same name differ if their parameters, their recordings or
-    their static options differ. They do not contain what the code of the environment computes.
+    the options of the environment differ. They do not contain what the code of the environment
+    computes.
     """
     name = str(getattr(env, "name", type(env).__name__))
-    # Static options, such as the channel of a disturbance, are not leaves of the parameters.
-    options = in_words(env)
     if is_simulated(env):  # the observed elements, and the arguments of its construction
         name, options = simulated_identity(env), getattr(env, "reward_from", "")
+    else:
+        # Options, such as the channel of a disturbance, are not leaves of the parameters.
+        options = in_words(env)
     numbers = [named_numbers(leaf) for leaf in jax.tree.leaves(params)]
-    return {"env": name, "params": numbers, PLANT: f"{options} with {in_words(params)}"}
+    return {
+        "env": name,
+        "params": numbers,
+        PLANT: f"{options} with {in_words(params, numbers=False)}",
+    }
 
 
 def named_numbers(leaf: ArrayLike) -> Any:

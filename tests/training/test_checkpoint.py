@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
+from gymnax.environments.misc.pointrobot import PointRobot
 
 import rtd3jax as rtd
 from rtd3jax.system.files import read_arrays, write_arrays
@@ -237,6 +238,14 @@ def test_another_environment_or_version_is_refused(stopped, monkeypatch):
         _train(stopped)
 
 
+class Weighted(PointRobot):
+    """An environment without `rtd.ValueIdentity`, with an option."""
+
+    def __init__(self, weights):
+        super().__init__()
+        self.weights = weights
+
+
 @pytest.mark.parametrize(
     ("first", "second", "difference"),
     [
@@ -249,6 +258,11 @@ def test_another_environment_or_version_is_refused(stopped, monkeypatch):
             rtd.disturb(rtd.make("pendulum"), rtd.Hidden(element=2)),
             rtd.disturb(rtd.make("pendulum"), rtd.Hidden(element=0)),
             "element=2.* there, .*element=0.* here",
+        ),
+        (
+            Weighted((1.0, 2.0)),
+            Weighted((5.0, 6.0)),
+            "1.0, 2.0.* there, .*5.0, 6.0.* here",
         ),
     ],
 )

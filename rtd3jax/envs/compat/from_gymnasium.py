@@ -16,6 +16,7 @@ from gymnasium.envs.registration import load_env_creator
 from rtd3jax.envs.compat.simulated_environment import FromGymnasium
 from rtd3jax.envs.compat.simulator import Fleet, say
 from rtd3jax.envs.compat.surface import surface_of
+from rtd3jax.envs.identity import in_words
 from rtd3jax.errors import UserError, nearest, short_reason, typed_reason
 
 PREFIX = "gymnasium:"
@@ -40,7 +41,9 @@ def from_gymnasium(
     begins with ``reset(seed=...)``, whose seed is drawn from the random numbers of the lane.
 
     Args:
-        env: an id, or a function that makes an environment.
+        env: an id, or a function that makes an environment. Checkpoints belong to an id or a class
+            by its name; to a function by its name, its code, its defaults and its closure; and to
+            the function and the arguments of a `functools.partial`.
         keep: indices of the observed elements, or a slice; all by default. Dict and Tuple
             observations are concatenated first; ``element_names`` names the elements.
         max_steps_in_episode: the time limit, a truncation; by default the environment's own limit,
@@ -62,8 +65,12 @@ def from_gymnasium(
         )
     if not isinstance(env, str) and not callable(env):
         raise UserError(f"{env!r} is neither an id of Gymnasium nor a function that makes one")
-    if isinstance(step_seconds, bool) or not 0 < step_seconds < math.inf:
+    number = isinstance(step_seconds, int | float | np.integer | np.floating)
+    if not number or isinstance(step_seconds, bool) or not 0 < step_seconds < math.inf:
         raise UserError(f"step_seconds={step_seconds!r} must be a number of seconds above 0")
+    _check_hashable(env, title)
+    # Before the first call, because a function may count its calls.
+    words = in_words(env) if not isinstance(env, str | type) else title, _keywords(kwargs)
 
     def make() -> gymnasium.Env:
         if not isinstance(env, str):
@@ -82,7 +89,7 @@ def from_gymnasium(
     made = (key, *map(id, code))
     if made not in _known:
         _known[made] = Fleet(make, read, float(step_seconds)), code
-    return FromGymnasium(key, title, _known[made][0], surface)
+    return FromGymnasium(key, words, title, _known[made][0], surface)
 
 
 _known: dict[tuple, tuple[Fleet, list[object]]] = {}
@@ -121,13 +128,36 @@ def _opaque(value: object) -> Iterator[object]:
         yield value
 
 
+def _check_hashable(env: object, title: str) -> None:
+    try:
+        hash(env)
+    except TypeError as error:
+        raise UserError(
+            f"{title} cannot be hashed ({error}), so compiled programs cannot be kept for it: make "
+            "it a @dataclass(frozen=True), or pass a function that makes the environment"
+        ) from error
+
+
 def _named(kwargs: dict[str, Any]) -> str:
     """A text that differs for different keywords, unlike ``repr``, which shortens large arrays."""
+    # An object that cannot be pickled only equals itself.
+    return _pickled(kwargs) or repr([(name, id(value)) for name, value in sorted(kwargs.items())])
+
+
+def _keywords(kwargs: dict[str, Any]) -> str:
+    """A text for files that differs for different keywords: it contains no ids."""
+    if not kwargs:
+        return ""
+    return _pickled(kwargs) or in_words(dict(sorted(kwargs.items())))
+
+
+def _pickled(kwargs: dict[str, Any]) -> str | None:
+    """A digest of keywords; None if one of them cannot be pickled."""
     try:
         code = pickle.dumps(sorted(kwargs.items()))
-    except Exception:  # an object that cannot be pickled only equals itself
-        return repr([(name, id(value)) for name, value in sorted(kwargs.items())])
-    return hashlib.sha256(code).hexdigest()[:16] if kwargs else ""
+    except Exception:  # code of others may raise anything
+        return None
+    return hashlib.sha256(code).hexdigest()[:16]
 
 
 def _example(make: Callable[[], Any], env: object, title: str) -> gymnasium.Env:

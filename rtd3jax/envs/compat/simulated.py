@@ -31,9 +31,9 @@ def simulated_identity(env: object) -> str:
     """A text that states how a simulated environment was made, as checkpoints store it."""
     base = innermost(env)
     assert isinstance(base, FromGymnasium)
-    made, kwargs, keep, limit, _ = base.identity()
-    name = made if isinstance(made, str) else base.name
-    return f"{name} keep={keep} limit={limit} {kwargs}".strip()
+    _, _, keep, limit, _ = base.identity()
+    made, kwargs = base.words
+    return f"{made} keep={keep} limit={limit} {kwargs}".strip()
 
 
 def release(env: object, env_state: object) -> None:

@@ -35,11 +35,17 @@ class SimulatorParams(struct.PyTreeNode):
 
 
 class FromGymnasium(ValueIdentity, environment.Environment):
-    """A Gymnasium environment behind gymnax's interface; made by `from_gymnasium`."""
+    """A Gymnasium environment behind gymnax's interface; made by `from_gymnasium`.
 
-    def __init__(self, key: tuple, title: str, fleet: Fleet, surface: Surface) -> None:
+    ``words`` states in words what makes the environment, and its keywords, as files store them.
+    """
+
+    def __init__(
+        self, key: tuple, words: tuple[str, str], title: str, fleet: Fleet, surface: Surface
+    ) -> None:
         super().__init__()
         self._key = key
+        self.words = words
         self._title = title
         self.fleet = fleet
         self._surface = surface
@@ -49,7 +55,7 @@ class FromGymnasium(ValueIdentity, environment.Environment):
         return self._key
 
     def _identity(self) -> tuple:
-        # `identity` is also stored in files. In this process, the simulators stand for the code.
+        # A key cannot tell whether code was edited. In this process, the simulators stand for it.
         return (*super()._identity(), self.fleet)
 
     @property

@@ -12,6 +12,7 @@ import hashlib
 import itertools
 import math
 import queue
+import reprlib
 import struct
 import threading
 import warnings
@@ -21,6 +22,7 @@ from typing import Any
 import numpy as np
 from jax.typing import ArrayLike
 
+from rtd3jax.envs.compat.surface import LARGEST
 from rtd3jax.errors import UserError, short_reason, typed_reason
 
 MOST = 1_024
@@ -124,12 +126,16 @@ class Simulator:
         observation = self._observation("step", answer[0])
         try:
             reward = float(answer[1]) if isinstance(answer[1], float) else _number(answer[1])
-        except (TypeError, ValueError):
-            raise self.failed(f"the reward {answer[1]!r} is not a number") from None
+        except Exception:  # an object of others may raise anything
+            raise self.failed(f"the reward {_shown(answer[1])} is not a number") from None
         if not math.isfinite(reward):
             raise self.failed(f"the reward is {reward}")
+        if abs(reward) > LARGEST:
+            raise self.failed(f"the reward is {reward:g}, too large for float32")
+        terminated = self._flag("terminated", answer[2])
+        truncated = self._flag("truncated", answer[3])
         self.place = seed, time + 1, _digest(digest, observation, reward)
-        return observation, reward, bool(answer[2]), bool(answer[3])
+        return observation, reward, terminated, truncated
 
     def close(self) -> None:
         """Close the environment, unless its thread hangs; further calls have no effect."""
@@ -164,7 +170,7 @@ class Simulator:
     def _observation(self, what: str, observation: object) -> np.ndarray:
         try:
             flat = self._read(observation)
-        except (TypeError, ValueError, KeyError, IndexError) as error:
+        except Exception as error:  # an object of others may raise anything
             raise self.failed(
                 f"the observation of {what} is unfit: {short_reason(error)}"
             ) from None
@@ -172,6 +178,23 @@ class Simulator:
             where = int(np.argmin(np.isfinite(flat)))
             raise self.failed(f"element {where} of the observation of {what} is {flat[where]}")
         return flat
+
+    def _flag(self, name: str, value: object) -> bool:
+        try:
+            flag = np.asarray(value)
+            return bool(value if flag.ndim == 0 else flag.reshape(()))
+        except Exception:  # an object of others may raise anything
+            raise self.failed(
+                f"step returned {name}={_shown(value)}, which is not True or False"
+            ) from None
+
+
+def _shown(value: object) -> str:
+    """A value of others in a message: short, and in one line."""
+    try:
+        return " ".join(reprlib.repr(value).split())
+    except Exception:  # Python refuses to write an integer of many digits
+        return f"of type {type(value).__name__}"
 
 
 def _number(reward: ArrayLike) -> float:

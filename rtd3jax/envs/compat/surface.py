@@ -13,6 +13,9 @@ from rtd3jax.envs.compat.elements import kept_elements, time_limit
 from rtd3jax.envs.entry import DEFAULT_STEP_LIMIT
 from rtd3jax.errors import UserError
 
+LARGEST = float(np.finfo(np.float32).max)
+"""The largest number of an observation or a reward, which the compiled program gets in float32."""
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Surface:
@@ -93,11 +96,16 @@ def surface_of(
     if limit is None:
         spec = getattr(example, "spec", None)
         limit = getattr(spec, "max_episode_steps", None) or DEFAULT_STEP_LIMIT
+    kept = np.asarray(indices)
 
     def read(observation: object) -> np.ndarray:
         flat = _flat(seen, observation)
         if flat.shape != (size,):
             raise ValueError(f"it has {flat.size} elements instead of {size}")
+        # Elements that are not observed stay float64. `Simulator` finds infinite ones.
+        large = [k for k in kept[np.abs(flat[kept]) > LARGEST] if math.isfinite(flat[k])]
+        if large:
+            raise ValueError(f"element {large[0]} is {flat[large[0]]:g}, too large for float32")
         return flat
 
     return Surface(actions, names, indices, time_limit(limit)), read

@@ -1,7 +1,10 @@
 """Gymnasium environments that are trained on: played, lost, resumed, refused."""
 
 import dataclasses
+import functools
+import hashlib
 import itertools
+import pickle
 import sys
 import time
 import warnings
@@ -82,12 +85,28 @@ class Cart(gymnasium.Env):
                 seen["a"] = np.zeros(3)
             if self.fault == "reward":
                 reward = "much"
+            if self.fault in STRANGE:
+                return STRANGE[self.fault](seen, reward)
             if self.fault == "four":
                 return seen, reward, False, {}
         return seen, reward, abs(self.x) > 0.7, False, {}
 
     def close(self):
         type(self).closed += 1
+
+
+STRANGE = {
+    "flags": lambda seen, reward: (seen, reward, np.array([True, False]), False, {}),
+    "no flag": lambda seen, reward: (seen, reward, False, [], {}),
+    "rewards": lambda seen, reward: (seen, np.eye(2), False, False, {}),
+    "huge reward": lambda seen, reward: (seen, 10**400, False, False, {}),
+    "endless reward": lambda seen, reward: (seen, 10**5_000, False, False, {}),
+    "wide reward": lambda seen, reward: (seen, -1e39, False, False, {}),
+    "huge": lambda seen, reward: ({**seen, "a": [10**400, 0]}, reward, False, False, {}),
+    "wide": lambda seen, reward: ({**seen, "a": np.array([1e39, 0])}, reward, False, False, {}),
+    "no dict": lambda seen, reward: (SimpleNamespace(), reward, False, False, {}),
+}
+"""What `Cart` returns with these faults."""
 
 
 def make(**kwargs):
@@ -183,6 +202,15 @@ def test_a_simulator_composes_with_a_disturbance_and_is_reset_at_ends_alone():
         ("shape", "shape (3,) instead of (2,)"),
         ("reward", "the reward 'much' is not a number"),
         ("four", "step returned 4 values"),
+        ("flags", "step returned terminated=array([ True, False]), which is not True or False"),
+        ("no flag", "step returned truncated=[], which is not True or False"),
+        ("rewards", "the reward array([[1., 0... [0., 1.]]) is not a number"),
+        ("huge reward", "is not a number"),
+        ("endless reward", "the reward of type int is not a number"),
+        ("wide reward", "the reward is -1e+39, too large for float32"),
+        ("huge", "the observation of step is unfit: int too large to convert to float"),
+        ("wide", "the observation of step is unfit: element 0 is 1e+39, too large for float32"),
+        ("no dict", "the observation of step is unfit: 'types.SimpleNamespace' object is not"),
     ],
 )
 def test_a_simulator_that_fails_says_how_and_stays_lost(fault, message):
@@ -199,6 +227,23 @@ def test_a_simulator_that_fails_says_how_and_stays_lost(fault, message):
         assert message in str(raised.value) and "\n" not in str(raised.value)
     with pytest.raises(Fault):
         fleet.reset(handle, 6)
+
+
+def test_a_large_element_that_is_not_observed_does_not_matter():
+    env = rtd.from_gymnasium(make, keep=[1, 2], fault="wide", at=1, max_steps_in_episode=3)
+    policy = rtd.constant_policy([0.1, 0.1])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert np.isfinite(rtd.evaluate(policy, env, 1)).all()
+    close_simulators()
+
+
+@pytest.mark.parametrize("fault", ["flags", "huge reward"])
+def test_what_step_should_not_return_does_not_end_the_program(fault):
+    env, policy = environment(fault=fault, at=2), rtd.constant_policy([0.1, 0.1])
+    with pytest.warns(UserWarning, match="the simulator failed: "):
+        assert np.isnan(rtd.evaluate(policy, env, 1)).all()
+    close_simulators()
 
 
 def test_other_lanes_go_on():
@@ -305,6 +350,16 @@ class Images(Cart):
     observation_space = gymnasium.spaces.Box(0, 255, (8, 8, 3), np.uint8)
 
 
+@dataclasses.dataclass
+class Unhashable:
+    """A factory that is equal to others, and so has no hash."""
+
+    at: int = 10
+
+    def __call__(self):
+        return Cart(at=self.at)
+
+
 def fails():
     raise OSError("no licence")
 
@@ -326,12 +381,19 @@ def lacks_a_package():
         (lambda: 3, "not a gymnasium.Env"),
         (Cart(), "a function that makes it"),
         (7, "neither an id"),
+        (Unhashable(), "Unhashable cannot be hashed (unhashable type: 'Unhashable'), so"),
     ],
 )
 def test_what_is_refused_in_one_line(given, message):
     with pytest.raises(rtd.UserError) as raised:
         rtd.from_gymnasium(given)
     assert message in str(raised.value) and "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("seconds", ["60", None, True, 0, np.inf, np.ones(2)])
+def test_a_limit_that_is_no_number_of_seconds_is_refused(seconds):
+    with pytest.raises(rtd.UserError, match="must be a number of seconds above 0"):
+        rtd.from_gymnasium(make, step_seconds=seconds)
 
 
 @pytest.mark.parametrize("keep", [[], [0, 0], [5], [-1], [0.5], "ab", 1.5, slice(3, 3)])
@@ -538,6 +600,66 @@ def test_equal_options_are_the_same_environment(monkeypatch):
     monkeypatch.setattr(sys.modules[__name__], "shaping", another(1.0))
     assert environment_with(1.0) not in (first, other)
     close_simulators()
+
+
+def made_with(at):
+    return lambda: Cart(at=at)
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (functools.partial(Cart, at=7), functools.partial(Cart, at=9)),
+        (functools.partial(make, at=7), functools.partial(make, at=9)),
+        (made_with(7), made_with(9)),
+        (lambda: Cart(at=7), lambda: Cart(at=9)),
+        (functools.partial(made_with(7)), functools.partial(made_with(9))),
+    ],
+)
+def test_files_know_what_a_function_makes(one, other):
+    texts = [simulated_identity(rtd.from_gymnasium(env, keep=[0])) for env in (one, other, one)]
+    assert texts[0] != texts[1] and texts[0] == texts[2]
+    assert "0x" not in "".join(texts)
+
+
+def test_files_know_ids_and_classes_by_their_names():
+    assert simulated_identity(rtd.from_gymnasium("Pendulum-v1")) == (
+        "Pendulum-v1 keep=(0, 1, 2) limit=200"
+    )
+    assert simulated_identity(rtd.from_gymnasium(Cart, keep=[0], max_steps_in_episode=5)) == (
+        "Cart keep=(0,) limit=5"
+    )
+    # A digest of what `pickle` stores of the keywords.
+    assert simulated_identity(rtd.from_gymnasium(Cart, keep=[0], at=3)) == (
+        f"Cart keep=(0,) limit=10000 {DIGEST}"
+    )
+
+
+DIGEST = hashlib.sha256(pickle.dumps([("at", 3)])).hexdigest()[:16]
+
+
+def test_files_know_keywords_that_cannot_be_pickled_by_their_code():
+    def made(hook):
+        env = rtd.from_gymnasium(Shaped, max_steps_in_episode=3, shaping=hook)
+        return env, simulated_identity(env)
+
+    hooks = [(lambda: 1.0) for _ in range(2)]
+    (one, text), (other, same) = map(made, hooks)
+    assert one != other and text == same  # in this process, each is its own simulators
+    assert text != made(lambda: 2.0)[1]
+    assert str(id(hooks[0])) not in text and "<lambda> " in text
+
+
+def test_a_function_that_counts_its_calls_has_one_text():
+    number = itertools.count()
+
+    def some():
+        return Cart(at=10 + next(number))
+
+    env = rtd.from_gymnasium(some, keep=[0])
+    text = simulated_identity(env)
+    some()
+    assert simulated_identity(env) == text
 
 
 class Changed(Cart):
