@@ -347,7 +347,8 @@ def _time_limits(record: _Record, limit: int | None, steps: int) -> Iterator[Fin
     """Finds a time limit that is reported as a termination, or has no effect."""
     longest = steps + 1 if limit is None else int(limit)
     known = longest <= steps
-    at_limit: np.ndarray = record.length == (longest if known else record.length[0])
+    # Not with the limit of the parameters: the environment may end its episodes before.
+    at_limit: np.ndarray = record.length == record.length[0]
     last = np.minimum(record.length, record.terminated.shape[1]) - 1
     terminated = record.terminated[np.arange(EPISODES), last]
     if record.ended.all() and at_limit.all() and terminated.all() and record.length[0] > 1:

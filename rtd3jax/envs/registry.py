@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, cast
 
 import gymnax
+import jax
+import numpy as np
 
 from rtd3jax.envs.by_name import disturbed_by_name
 from rtd3jax.envs.compat.from_gymnasium import PREFIX, from_gymnasium
@@ -14,10 +16,13 @@ from rtd3jax.envs.compat.gymnax import make_gymnax
 from rtd3jax.envs.description import Description, Drawing
 from rtd3jax.envs.disturbed import (
     Disturbed,
+    DisturbedParams,
     acting_processes,
     check_composable,
 )
 from rtd3jax.envs.entry import check_gymnax, own_parameters
+from rtd3jax.envs.identity import in_words
+from rtd3jax.envs.interface import environment_name
 from rtd3jax.envs.parameters import parse_disturbance
 from rtd3jax.envs.processes.process import Process
 from rtd3jax.envs.registered import (
@@ -54,6 +59,13 @@ def make(env_id: str, disturbance: str = "none", **parameters: Any) -> Any:
     Raises:
         UserError: for an unknown id, disturbance or parameter, or an impossible value.
     """
+    if not isinstance(env_id, str):
+        if callable(getattr(env_id, "reset", None)) and not isinstance(env_id, type):
+            raise UserError(
+                f"make takes the name of an environment, and this {environment_name(env_id)} is "
+                "an environment already: use rtd.disturb(env, process) to disturb it"
+            )
+        raise UserError(f"an environment's name is a string such as 'rover', not {env_id!r}")
     disturbance, own = parse_disturbance(disturbance)
     if twice := sorted(own.keys() & parameters.keys()):
         raise UserError(f"{twice[0]!r} is given twice: in the disturbance and as an argument")
@@ -190,12 +202,32 @@ def description_of(env: EnvironmentLike, env_id: str | None = None) -> Descripti
     """The description registered for ``env_id``, or else for an environment equal to ``env``.
 
     ``env`` may be disturbed. For an environment that is not registered, the description is empty.
+
+    Several ids may stand for equal environments with other default parameters, because parameters
+    do not matter for equality. The description is then that of the id whose default parameters
+    differ the least from those of ``env``; of ids with the same ones, that of the last in the
+    registry. Only ``env_id`` can tell such ids apart.
     """
     if env_id in _entries:
         return _entries[env_id].description
     base = env.base if isinstance(env, Disturbed) else env
-    known = (e.description for e in _entries.values() if e.env is not None and e.env == base)
-    return next(known, Description())
+    known = [e for e in _entries.values() if e.env is not None and e.env == base]
+    if len(known) > 1:
+        params = getattr(env, "default_params", None)
+        params = params.env if isinstance(params, DisturbedParams) else params
+        known = sorted(known[::-1], key=lambda entry: _differences(entry.env, params))
+    return known[0].description if known else Description()
+
+
+def _differences(env: EnvironmentLike | None, params: object) -> int:
+    """How many of ``params`` differ from the default parameters of ``env``."""
+    own = getattr(env, "default_params", None)
+    one, other = (dict(jax.tree_util.tree_leaves_with_path(tree)) for tree in (own, params))
+    options = in_words(own, numbers=False) != in_words(params, numbers=False)
+    return options + sum(
+        not (path in one and path in other and np.array_equal(one[path], other[path]))
+        for path in one.keys() | other.keys()
+    )
 
 
 def disturbances_of(env_id: str) -> tuple[str, ...]:

@@ -130,6 +130,17 @@ class TimeLimitTerminates(Good):
         return observation, state, reward, state.time >= params.max_steps_in_episode, info
 
 
+class EarlierLimitTerminates(TimeLimitTerminates):
+    """It ends its episodes before the limit of its parameters."""
+
+    @property
+    def default_params(self):
+        return environment.EnvParams(max_steps_in_episode=50)
+
+    def step_env(self, key, state, action, params):
+        return super().step_env(key, state, action, params.replace(max_steps_in_episode=5))
+
+
 class NamelessLimitTerminates(Good):
     """Its limit is its own, and no parameter names it."""
 
@@ -218,6 +229,7 @@ BROKEN = [
     (HostRandom, "pure", "step gives different results"),
     (TimeLimitTerminates, "time-limit", "all 8 episodes terminate at step 8"),
     (NamelessLimitTerminates, "time-limit", "all 8 episodes terminate at step 5"),
+    (EarlierLimitTerminates, "time-limit", "all 8 episodes terminate at step 5"),
     (Endless, "time-limit", "continues after params.max_steps_in_episode = 8"),
     (NextObservation, "final-observation", "next episode's first observation"),
     (OldObservation, "final-observation", "during an episode"),

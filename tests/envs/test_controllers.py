@@ -135,6 +135,8 @@ def test_the_integral_does_not_wind_up(sign):
         ({"elements": (False, True)}, "elements must be 2 integers from 0 to 1"),
         ({"elements": ((0,), 1)}, "elements must be 2 integers from 0 to 1"),
         ({"seconds": 0}, "seconds must be greater than 0, not 0"),
+        ({"seconds": "1"}, "seconds must be greater than 0, not '1'"),
+        ({"seconds": None}, "seconds must be greater than 0, not None"),
         ({"ignored": -1}, "ignored must be an integer of at least 0, not -1"),
     ],
 )
@@ -199,6 +201,26 @@ def test_a_regulator_that_cannot_be_is_one_line(disturbance, state, arguments, m
 def test_another_environments_state_is_one_line():
     with pytest.raises(rtd.UserError, match="rover could not be linearised"):
         rtd.lqr_policy(rtd.make("rover"), top())
+
+
+def test_a_regulator_sees_the_gradients_of_a_rover():
+    env, command = rtd.make("rover"), jnp.array([0.5, 0.0])
+    _, state, *_ = env.step(jax.random.key(0), env.reset(jax.random.key(0))[1], command)
+    policy = rtd.lqr_policy(env, state, command)
+    np.testing.assert_allclose(policy.gain, 0.0, atol=1e-6)  # a rover does at once what it is told
+    assert float(rtd.evaluate(policy, env, 1)[0]) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_regulator_names_what_it_cannot_know_of_a_rover_on_soil():
+    env, command = rtd.make("rover-soil", max_steps_in_episode=60), jnp.array([0.5, 0.0])
+    _, state = env.reset(jax.random.key(0))
+    for _ in range(50):
+        _, state, *_ = env.step(jax.random.key(0), state, command)
+    leaves = jax.tree_util.tree_leaves_with_path(state)
+    sizes = [(path[0].name, leaf.size) for path, leaf in leaves if leaf.dtype == jnp.float32]
+    cost = [np.full(n, float(name in ("speed", "yaw_rate"))) for name, n in sizes]
+    with pytest.raises(rtd.UserError, match="the observation does not determine"):
+        rtd.lqr_policy(env, state, command, q=np.concatenate(cost), r=0.1)
 
 
 def test_the_rovers_controller_is_near_the_best():

@@ -15,6 +15,7 @@ from gymnax.environments import environment, spaces
 
 from rtd3jax.envs import registry
 from rtd3jax.envs.builtin import DISTURBANCES, ENVIRONMENTS
+from rtd3jax.envs.description import Ceiling
 from rtd3jax.envs.disturbed import Disturbed, disturb
 from rtd3jax.envs.entry import parameters_of
 from rtd3jax.envs.parameters import parse_disturbance
@@ -22,6 +23,8 @@ from rtd3jax.envs.processes.disturbances import GaussianNoise, Hidden, Pulses, S
 from rtd3jax.envs.processes.faults import Delay, Dropout
 from rtd3jax.envs.processes.process import Chain
 from rtd3jax.envs.registry import make, register
+from rtd3jax.envs.rover import Rover, RoverParams
+from rtd3jax.envs.rover.slip import Ar1Slip
 from rtd3jax.errors import UserError, nearest
 
 ALL = [(env, disturbance) for env in ENVIRONMENTS for disturbance in DISTURBANCES[env]]
@@ -310,6 +313,47 @@ def test_a_cell_that_runs_again_registers_again(monkeypatch):
     assert make("robot").base is base
     with pytest.raises(UserError, match="registered by library"):
         run("notebook", base)
+
+
+def test_of_equal_environments_the_one_with_the_nearest_parameters_is_meant(monkeypatch):
+    monkeypatch.setattr(registry, "_entries", dict(registry._entries))
+    built_in = registry.description_of(make("rover"), "rover").ceiling
+
+    def own(env, episodes, seed):
+        return Ceiling(7.0)
+
+    fast = Rover(RoverParams(target_speed=0.8))
+    slips = {"ar1-slip": ("slip", Ar1Slip())}
+    register("my-rover", fast, slips, ceiling=own, with_params=Rover)
+    for made, ceiling in (
+        (make("my-rover"), own),
+        (make("my-rover", "ar1-slip"), own),
+        (make("my-rover", "dropout"), own),
+        (make("rover"), built_in),
+        (make("rover", "ar1-slip"), built_in),
+        (make("rover", "delay"), built_in),
+    ):
+        assert registry.description_of(made).ceiling is ceiling
+    # Of environments with the same parameters, the last one is meant.
+    register("plain-rover", Rover(), ceiling=own)
+    assert registry.description_of(make("rover")).ceiling is own
+    assert registry.description_of(make("rover"), "rover").ceiling is built_in
+
+
+@pytest.mark.parametrize(
+    ("given", "match"),
+    [
+        (make("pendulum"), "this Pendulum-v1 is an environment already: use rtd.disturb"),
+        (make("rover"), "this rover is an environment already: use rtd.disturb"),
+        (5, "a string such as 'rover', not 5"),
+        (["rover"], "a string such as 'rover', not"),
+        (Rover, "a string such as 'rover', not"),
+    ],
+)
+def test_what_is_no_name_is_one_line(given, match):
+    with pytest.raises(UserError, match=match) as caught:
+        make(given)
+    assert "\n" not in str(caught.value)
 
 
 def test_a_new_registration_keeps_nothing_of_the_one_that_it_replaces(monkeypatch):

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
-from gymnax.environments.misc.pointrobot import PointRobot
+from gymnax.environments.classic_control.pendulum import Pendulum
 
 import rtd3jax as rtd
 from rtd3jax.system.files import read_arrays, write_arrays
@@ -238,7 +238,7 @@ def test_another_environment_or_version_is_refused(stopped, monkeypatch):
         _train(stopped)
 
 
-class Weighted(PointRobot):
+class Weighted(Pendulum):
     """An environment without `rtd.ValueIdentity`, with an option."""
 
     def __init__(self, weights):

@@ -125,7 +125,8 @@ def pid_policy(
             f"pid_policy: elements must be {size} integers from 0 to {own.observation_size - 1}, "
             f"not {elements!r}"
         )
-    if not (np.ndim(seconds) == 0 and np.isfinite(seconds) and seconds > 0):
+    number = np.ndim(seconds) == 0 and np.asarray(seconds).dtype.kind in "iuf"
+    if not (number and np.isfinite(seconds) and seconds > 0):
         raise UserError(f"pid_policy: seconds must be greater than 0, not {seconds!r}")
     if not is_integer(ignored) or ignored < 0:
         raise UserError(f"pid_policy: ignored must be an integer of at least 0, not {ignored!r}")

@@ -132,7 +132,8 @@ def filter_policy(env: EnvironmentLike) -> FilterPolicy:
         env: a pendulum, undisturbed or under ``noise``, ``hidden`` or one of the sines.
 
     Raises:
-        UserError: for other environments and disturbances.
+        UserError: for other environments and disturbances, for a sigma of each element, and for
+            noise without gravity.
     """
     params, base = env.default_params, env
     process: Process = NoDisturbance()
@@ -145,9 +146,18 @@ def filter_policy(env: EnvironmentLike) -> FilterPolicy:
         params = params.env
     if not isinstance(base, Pendulum):
         raise UserError("filter_policy is only known for the pendulum")
+    if isinstance(process, GaussianNoise) and np.ndim(process.sigma):
+        raise UserError(
+            "filter_policy only covers noise with the same sigma for all elements: pass one number "
+            "as sigma"
+        )
     sensor = _sensor(process)
     sigma = float(process.sigma) if isinstance(process, GaussianNoise) else 0.0
     noisy = sigma > EXACT
+    if noisy and not params.g > 0:
+        raise UserError(
+            f"filter_policy needs gravity under noise: g={params.g} must be greater than 0"
+        )
     kick = KICK * sigma if noisy else 0.0
     finer = 1 if noisy else 2
     values, _ = optimal_values(params, finer * ANGLES, finer * SPEEDS, STEPS, kick)

@@ -225,7 +225,14 @@ def require_ordered(process: object, low_name: str, high_name: str) -> None:
     low, high = getattr(process, low_name), getattr(process, high_name)
     if isinstance(low, jax.core.Tracer) or isinstance(high, jax.core.Tracer):
         return
-    if np.any(np.asarray(low) > np.asarray(high)):
+    try:
+        exceeds = np.any(np.asarray(low) > np.asarray(high))
+    except ValueError:  # numpy cannot broadcast them
+        raise UserError(
+            f"{type(process).__name__}: {low_name} of shape {np.shape(low)} and {high_name} of "
+            f"shape {np.shape(high)} do not fit; pass one number, or one for each element"
+        ) from None
+    if exceeds:
         raise UserError(
             f"{type(process).__name__}: {low_name}={low} is greater than {high_name}={high}"
         )

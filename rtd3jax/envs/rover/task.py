@@ -33,6 +33,9 @@ class MotionState(Protocol):
 class DrivingTask(ValueIdentity, environment.Environment):
     """Task: hold a speed and a yaw rate. Actions [2] command them; observations [2] are errors."""
 
+    # Steps stop gradients, except those of gymnax's `with_transition_gradients`, for the LQR.
+    _supports_transition_gradients = True
+
     def outcome(self, evolved: Any, params: Any) -> tuple[Any, Any, jax.Array, jax.Array, dict]:
         """The values that ``step_env`` returns; ``evolved`` is the state after the step.
 

@@ -159,8 +159,27 @@ def exit_angle(soil: LocalSoil, entry: jax.Array) -> jax.Array:
     ``-arccos(1 - lambda (1 - cos(entry)))``. The code uses sines of half angles, because float32
     rounds ``1 - cos`` of a small angle coarsely.
     """
-    sine = jnp.minimum(jnp.sqrt(soil.exit_ratio) * sine_of(0.5 * entry), 1.0)
+    sine = jnp.minimum(_root(soil.exit_ratio) * sine_of(0.5 * entry), 1.0)
     return -2.0 * _arcsine(sine)
+
+
+@jax.custom_jvp
+def _root(value: jax.Array) -> jax.Array:
+    """The square root, whose derivative at 0 is 0.
+
+    A soil without an exit angle has the ratio 0 everywhere. The infinite derivative would make the
+    gradients by the rover's place NaN.
+    """
+    return jnp.sqrt(value)
+
+
+@_root.defjvp
+def _root_derivative(
+    values: tuple[jax.Array], changes: tuple[jax.Array]
+) -> tuple[jax.Array, jax.Array]:
+    (value,), (change,) = values, changes
+    slope = jnp.where(value > 0.0, 0.5 / jnp.sqrt(jnp.where(value > 0.0, value, 1.0)), 0.0)
+    return _root(value), slope * change
 
 
 def _arcsine(sine: jax.Array) -> jax.Array:

@@ -95,3 +95,9 @@ def test_other_environments_are_refused_in_one_line():
         rtd.filter_policy(rtd.make("rover"))
     with pytest.raises(rtd.UserError, match="does not cover this Pulses"):
         rtd.filter_policy(rtd.make("pendulum", "temporal-bias"))
+    noise = rtd.GaussianNoise(np.array([0.1, 0.1, 0.5]))
+    with pytest.raises(rtd.UserError, match="the same sigma for all elements"):
+        rtd.filter_policy(rtd.disturb(rtd.make("pendulum"), noise))
+    for g in (-1.0, 0.0):
+        with pytest.raises(rtd.UserError, match=f"g={g} must be greater than 0"):
+            rtd.filter_policy(rtd.make("pendulum", "noise", g=g))

@@ -375,6 +375,10 @@ def test_parameters_can_be_mapped_over():
         (Pulses(length=0), "length"),
         (Pulses(elements=(0, 0)), "elements"),
         (Sine(period_min=200.0), "period_min"),
+        (
+            Sine(amplitude_min=np.zeros(2), amplitude_max=np.ones(3)),
+            r"amplitude_.* of shape \(2,\)",
+        ),
         (Sine(period_min=0.0), "period_min"),
         (Sine(waves=0), "waves"),
         (DampedSine(amplitude_max=float("inf")), "amplitude_max"),

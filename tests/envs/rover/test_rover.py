@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 
 import rtd3jax as rtd
 from rtd3jax.envs.builtin import DISTURBANCES
@@ -185,3 +186,43 @@ def test_the_hidden_slip_of_one_process_is_its_own():
     one_wheel = Ar1SlipState(jnp.ones(1))
     assert next_slip(state.replace(slip=(one_wheel, one_wheel))) is None
     assert next_slip(state.replace(slip=())) is None
+
+
+@pytest.mark.parametrize(("plant", "slip"), [("rover", "ar1-slip"), ("rover-soil", "dry-sand")])
+def test_gradients_through_a_step_are_differences(plant, slip):
+    env = rtd.make(plant, slip)
+    params, key = env.default_params, jax.random.key(3)
+    state = env.reset(key, params)[1].replace(speed=jnp.float32(0.3), yaw_rate=jnp.float32(0.1))
+    leaves, structure = jax.tree.flatten(state)
+    moving = [k for k, leaf in enumerate(leaves) if leaf.dtype == jnp.float32]
+    start, restore = ravel_pytree(([leaves[k] for k in moving], jnp.array([0.43, 0.11])))
+
+    def outcome(env, point):
+        floats, action = restore(point)
+        parts = list(leaves)
+        for k, leaf in zip(moving, floats, strict=True):
+            parts[k] = leaf
+        given = jax.tree.unflatten(structure, parts)
+        observation, after, reward, *_ = env.step_env(key, given, action, params)
+        return jnp.concatenate([observation, reward[None]]), after
+
+    def seen(env):
+        return jax.jit(lambda point: outcome(env, point)[0])
+
+    with_gradients = env.with_transition_gradients()
+    own = np.asarray(jax.jit(jax.jacobian(seen(with_gradients)))(start))
+    assert np.isfinite(own).all() and np.abs(own[:, -2:]).max() > 0.3
+    directions = np.random.default_rng(0).normal(size=(20, start.size)).astype(np.float32)
+    directions = np.vstack([directions, np.eye(start.size, dtype=np.float32)[-2:]])
+    for direction in directions / np.linalg.norm(directions, axis=1, keepdims=True):
+        up, down = (seen(env)(start + sign * 2e-3 * direction) for sign in (1, -1))
+        slope = (np.asarray(up, np.float64) - np.asarray(down, np.float64)) / 4e-3
+        np.testing.assert_allclose(own @ direction, slope, rtol=0.02, atol=2e-3)
+    # A step of training is the same with and without, and stops gradients of the observation.
+    for one, other in zip(
+        jax.tree.leaves(jax.jit(lambda p: outcome(env, p))(start)),
+        jax.tree.leaves(jax.jit(lambda p: outcome(with_gradients, p))(start)),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(one, other)
+    assert not np.asarray(jax.jit(jax.jacobian(seen(env)))(start))[:2].any()
