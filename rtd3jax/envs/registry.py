@@ -21,7 +21,6 @@ from rtd3jax.envs.disturbed import (
     check_composable,
 )
 from rtd3jax.envs.entry import check_gymnax, own_parameters
-from rtd3jax.envs.identity import in_words
 from rtd3jax.envs.interface import environment_name
 from rtd3jax.envs.parameters import parse_disturbance
 from rtd3jax.envs.processes.process import Process
@@ -35,6 +34,7 @@ from rtd3jax.envs.registered import (
     with_defaults,
 )
 from rtd3jax.envs.stress import Stress
+from rtd3jax.envs.words import in_words
 from rtd3jax.errors import UserError, nearest
 from rtd3jax.protocols import EnvironmentLike
 

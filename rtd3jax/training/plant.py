@@ -8,7 +8,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from rtd3jax.envs.compat.simulated import is_simulated, simulated_identity
-from rtd3jax.envs.identity import in_words
+from rtd3jax.envs.words import in_words
 from rtd3jax.protocols import EnvironmentLike
 
 MOST_NUMBERS = 1_000

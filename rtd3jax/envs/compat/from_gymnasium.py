@@ -16,7 +16,7 @@ from gymnasium.envs.registration import load_env_creator
 from rtd3jax.envs.compat.simulated_environment import FromGymnasium
 from rtd3jax.envs.compat.simulator import Fleet, say
 from rtd3jax.envs.compat.surface import surface_of
-from rtd3jax.envs.identity import in_words
+from rtd3jax.envs.words import in_words
 from rtd3jax.errors import UserError, nearest, short_reason, typed_reason
 
 PREFIX = "gymnasium:"

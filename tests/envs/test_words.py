@@ -16,7 +16,7 @@ import pytest
 from gymnax.environments import environment
 
 import rtd3jax as rtd
-from rtd3jax.envs.identity import in_words
+from rtd3jax.envs.words import in_words
 from rtd3jax.training.plant import plant_of
 
 
@@ -185,7 +185,7 @@ def test_a_cached_property_does_not_change_the_text():
 
 
 SCRIPT = """
-from rtd3jax.envs.identity import in_words
+from rtd3jax.envs.words import in_words
 class Part:
     pass
 def of(x, hook=lambda y: y in {"left", "right", "up"}):
