@@ -110,7 +110,7 @@ def test_a_killed_process_is_replaced_and_every_file_is_the_same(
     at_a_lanes_first_steps(kill)
     assert run(out, "--processes", "2") == 0
     assert len(begun) == 3 and killed[0] in begun and all(map(is_gone, begun))
-    assert pinned == [set(cores) for cores in process_plan._divided(2).cores]
+    assert pinned == [set(cores) for cores in process_plan.shares_of(2, lanes_of(2), "map").cores]
     assert contents(out) == contents(whole)
     keys = [(row["seed"], row["step"]) for row in read_log(out / LOG)]
     assert sorted(keys) == [(s, k) for s in range(SEEDS) for k in range(1000, STEPS + 1, 1000)]

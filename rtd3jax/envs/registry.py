@@ -205,8 +205,9 @@ def description_of(env: EnvironmentLike, env_id: str | None = None) -> Descripti
 
     Several ids may stand for equal environments with other default parameters, because parameters
     do not matter for equality. The description is then that of the id whose default parameters
-    differ the least from those of ``env``; of ids with the same ones, that of the last in the
-    registry. Only ``env_id`` can tell such ids apart.
+    differ the least from those of ``env``; of ids with the same ones, that of the first in the
+    registry, so that a later id does not change what an earlier one means. Only ``env_id`` can tell
+    such ids apart.
     """
     if env_id in _entries:
         return _entries[env_id].description
@@ -215,7 +216,7 @@ def description_of(env: EnvironmentLike, env_id: str | None = None) -> Descripti
     if len(known) > 1:
         params = getattr(env, "default_params", None)
         params = params.env if isinstance(params, DisturbedParams) else params
-        known = sorted(known[::-1], key=lambda entry: _differences(entry.env, params))
+        known = sorted(known, key=lambda entry: _differences(entry.env, params))
     return known[0].description if known else Description()
 
 

@@ -334,10 +334,10 @@ def test_of_equal_environments_the_one_with_the_nearest_parameters_is_meant(monk
         (make("rover", "delay"), built_in),
     ):
         assert registry.description_of(made).ceiling is ceiling
-    # Of environments with the same parameters, the last one is meant.
+    # Another id of the same environment and parameters does not change what the first one means.
     register("plain-rover", Rover(), ceiling=own)
-    assert registry.description_of(make("rover")).ceiling is own
-    assert registry.description_of(make("rover"), "rover").ceiling is built_in
+    assert registry.description_of(make("rover")).ceiling is built_in
+    assert registry.description_of(make("rover"), "plain-rover").ceiling is own
 
 
 @pytest.mark.parametrize(
