@@ -7,7 +7,6 @@ from rtd3jax.errors import UserError
 from rtd3jax.policies.serialization import read_policy
 from rtd3jax.policies.trained import Policy
 from rtd3jax.system.files import user_path
-from rtd3jax.system.numbers import check_count
 
 if TYPE_CHECKING:
     from rtd3jax.study.cells import Cell
@@ -65,12 +64,8 @@ def load_policy(
 
     directory = RunDirectory.open(path)
     seed = given.pop("seed", 0)
-    check_count("seed", seed, 0)
-    seed = int(seed)
     cell = _choose(directory, given)
-    if seed not in directory.seeds:
-        raise UserError(f"{path} has no seed {seed}; its seeds are {directory.seeds}")
-    return directory.lanes.policy(cell, seed)
+    return directory.lanes.policy(cell, directory.own_seed(seed))
 
 
 def _choose(directory: "RunDirectory", wanted: dict[str, Any]) -> "Cell":

@@ -32,6 +32,7 @@ from rtd3jax.system.files import (
     user_path,
     write_bytes_atomically,
 )
+from rtd3jax.system.numbers import check_count
 from rtd3jax.system.versions import versions_of
 from rtd3jax.training.checkpoint_files import checkpoint_steps
 from rtd3jax.training.jobs import Job
@@ -99,6 +100,13 @@ class RunDirectory:
     def episodes(self) -> int:
         """Number of episodes in the final evaluation of a lane."""
         return self.contents.episodes
+
+    def own_seed(self, seed: int) -> int:
+        """``seed`` as an integer; UserError if it is not a seed of the study."""
+        check_count("seed", seed, 0)
+        if seed not in self.seeds:
+            raise UserError(f"{self.path} has no seed {seed}; its seeds are {self.seeds}")
+        return int(seed)
 
     def jobs(self, strategy: str) -> list[Job]:
         """A job for each lane."""

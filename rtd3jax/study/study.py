@@ -30,7 +30,7 @@ from rtd3jax.study.status import ledger
 from rtd3jax.study.tables import current_tables
 from rtd3jax.system.files import user_path
 from rtd3jax.system.interrupts import terminable
-from rtd3jax.system.numbers import check_count, check_counts
+from rtd3jax.system.numbers import check_counts
 from rtd3jax.training.arguments import check_checkpoints, check_seeds, check_strategy
 from rtd3jax.training.devices import workers
 
@@ -162,12 +162,7 @@ class Study:
         if not isinstance(cell, Cell):
             raise UserError(f"a study consists of rtd.Cell, not {type(cell).__name__}")
         self._directory.contents.check_cell(self.path, cell)
-        check_count("seed", seed, 0)
-        if seed not in self._directory.seeds:
-            raise UserError(
-                f"{self.path} has no seed {seed}; its seeds are {self._directory.seeds}"
-            )
-        return self._directory.lanes.policy(cell, int(seed))
+        return self._directory.lanes.policy(cell, self._directory.own_seed(seed))
 
 
 def _distinct(cells: Iterable[Cell]) -> list[Cell]:

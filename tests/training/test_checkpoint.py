@@ -409,10 +409,9 @@ def test_large_checkpoints_wait_longer_by_default(tmp_path, monkeypatch):
     monkeypatch.setattr(checkpoint.time, "monotonic", lambda: now[0])
     monkeypatch.setattr(checkpoint, "cores", lambda: 2)
 
-    def lane(**fields):
-        return SimpleNamespace(
-            step=1, lanes=lambda: [(None, {"leaf": np.zeros(1)})], finished=False, **fields
-        )
+    def lane():
+        states = [(None, {"leaf": np.zeros(1)})]
+        return SimpleNamespace(step=1, lanes=lambda: states, finished=False)
 
     def slow_write(*_):
         now[0] += 6.0

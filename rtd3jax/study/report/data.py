@@ -100,7 +100,9 @@ def _with_log(
     """The curves of ended lanes, and those of other lanes, which are only in the log."""
     key = [*CELL, "seed"]
     kept = set(curves[key].itertuples(index=False, name=None))
-    study = {(*cell.key.values(), seed) for cell in directory.cells for seed in directory.seeds}
+    study = {
+        (*cell.key.values(), seed): cell for cell in directory.cells for seed in directory.seeds
+    }
     rows: dict[tuple, dict[int, dict[str, Any]]] = defaultdict(dict)
     for row in log:
         lane = lane_of(row)
@@ -111,11 +113,10 @@ def _with_log(
                 del rows[lane][step]
             point = {name: row[name] for name in (*key, "step")}
             rows[lane][row["step"]] = {**point, "return": value, "true_return": math.nan}
-    cells = {tuple(cell.key.values()): cell for cell in directory.cells}
     points = [
         point
-        for (*key, seed), own in rows.items()
-        if not _was_removed(directory, cells[tuple(key)], seed, max(own))
+        for lane, own in rows.items()
+        if not _was_removed(directory, study[lane], lane[-1], max(own))
         for point in own.values()
     ]
     return pd.concat([curves, pd.DataFrame(points)[curves.columns]]) if points else curves
